@@ -67,6 +67,8 @@ from jointctl.firmware_py.velocity import step_velocity
 #
 # The phases themselves are in `sequence`, the limits in `safety`.
 
+MOVES_AGAIN = 3.0  # times `standstill_radps`: a joint that has stood does so no more
+
 
 @kernel
 def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> int:
@@ -130,14 +132,19 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
 def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
     """RAMPING: brake the reference, then wait until the joint itself has stood for a while.
 
-    One slow reading is not enough: an oscillating joint has one at every reversal.
+    One slow reading is not enough: an oscillating joint has one at every reversal.  One that has stood stays `ready`
+    for the others of its arm until it clearly moves: with a noisy encoder they would never be so in the same cycle.
     """
+    if state.ready != 0 and state.held_back == 0:
+        enter(state, AxisPhase.RELEASING)  # as all others do, whatever the readings of this cycle
+        return
     for _ in range(elapsed_cycles):
         brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
-    still = abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps
-    if not still or state.reference.velocity_radps != 0.0:
-        state.still_cycles = 0
+    speed_radps = abs(state.velocity.velocity_radps)
+    if not speed_radps <= MOVES_AGAIN * constants.limits.standstill_radps:
         state.ready = 0
+    if not speed_radps <= constants.limits.standstill_radps or state.reference.velocity_radps != 0.0:
+        state.still_cycles = 0
     elif state.sample_age_cycles == 0:  # a lost sample proves nothing either way
         state.still_cycles += elapsed_cycles
         if state.still_cycles >= constants.sequence.settle_cycles:

@@ -361,6 +361,8 @@ def _wrong_report(
         reported = earliest[0]
     elif first < 0 or faulty in earliest:
         reported = faulty
+    elif Fault.LIMIT_CYCLE in FAULT_CLASSES[fault.kind].causes and runs[earliest[0]].fault is Fault.LIMIT_CYCLE:
+        reported = earliest[0]  # a joint that swings shakes the others, and a lighter one shows it first
     else:
         return [f"the fault is reported as that of {names[earliest[0]]}, {runs[earliest[0]].fault.name}"]
     found = [f"{names[reported]}: {line}" for line in wrong_cause(runs[reported], fault, period_ns * 1e-9, start_ns)]

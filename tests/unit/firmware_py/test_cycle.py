@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 from collections import deque
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.firmware_py.axis import MOVES_AGAIN, _brake
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, Clock, CycleMemory, Exchange, Slot, Word, step_cycle
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
@@ -225,6 +227,40 @@ def test_a_joint_that_stands_keeps_its_torque_until_the_other_one_stands(late: i
     assert arm.phases == [AxisPhase.RELEASING] * 2
     assert arm.run(500).ended
     assert arm.faults == [Fault.NONE] * 2
+
+
+def standing(late: int, times: float, steps: int) -> Arm:
+    """Both have stood; then the reading of `late` moves so many `standstill_radps`, for so many cycles."""
+    arm = Arm().run(300)
+    arm.memory.words[Word.STOP] = StopRequest.RAMP
+    while not arm.state.ready.all() and arm.cycles < 2000:
+        arm.run(1)
+    assert arm.phases == [AxisPhase.RAMPING] * 2
+    for _ in range(steps):
+        arm.state[late].held_back = 1
+        arm.state[late].velocity.velocity_radps = times * arm.constants[late].limits.standstill_radps
+        _brake(arm.constants[late], arm.state[late], 1)
+    return arm
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_joints_that_have_stood_release_their_torque_in_the_same_cycle_whatever_one_reads_in_it(late: int) -> None:
+    arm = Arm().run(300)
+    arm.memory.words[Word.STOP] = StopRequest.RAMP
+    while not arm.state.ready.all() and arm.cycles < 2000:
+        arm.run(1)
+    arm.moving_rad[late] = 0.5 * PERIOD_NS * 1e-9  # far above its standstill
+    arm.run(1)
+    assert arm.state[late].velocity.velocity_radps > MOVES_AGAIN * arm.constants[late].limits.standstill_radps
+    assert arm.phases == [AxisPhase.RELEASING] * 2
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize(("times", "ready"), [(0.9, 1), (1.1, 1), (2.9, 1), (3.1, 0), (-3.1, 0), (math.nan, 0)])
+def test_a_joint_that_has_stood_stays_ready_until_it_clearly_moves(late: int, times: float, ready: int) -> None:
+    arm = standing(late, times, 20)
+    assert (arm.state[late].ready, arm.state[late].phase) == (ready, AxisPhase.RAMPING)
+    assert bool(arm.state[late].still_cycles > 0) is (abs(times) < 1.0)
 
 
 @pytest.mark.parametrize("late", [0, 1])
