@@ -14,9 +14,12 @@ from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.output import Output
+from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.response import response
 from jointctl.tools.verbs.tune import tune
+from jointctl.tools.verbs.tune_steps import Tune
 from tests.configurations import changed, written
 
 IN_LOCKSTEP = ResponseOptions(lockstep=True)
@@ -97,12 +100,29 @@ def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:
     assert load_config(wrong).control.kv != load_config(folder / "before.toml").control.kv
 
 
+def test_gains_that_measure_better_bring_their_own_margins(wrong: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = iter(0.1 * 0.5**k for k in range(20))
+    monkeypatch.setattr(Tune, "_verified", lambda *_: {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1})
+    output, *_ = outputs()
+    silent = TerminalConsent(output, assume_yes=True)
+    job = Tune(load_config(wrong), TuneOptions(lockstep=True, refine=True), Carrier(output, silent, None), wrong.parent)
+    job.carry_out("")
+    gains, kept = job.gains, job.state["gains"]
+    assert gains is not None
+    assert len(job.state["refinement"]["runs"]) > 1
+    assert kept["control"]["kv"] == job.config.control.kv == gains.best.settings.kv
+    assert kept["control"]["kv"] == job.state["refinement"]["runs"][-1]["kv"]
+    assert kept["phase_margin_deg"] == gains.best.phase_margin_deg
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
         # as stuck as a joint with its brake closed
         ({"virtual__friction_positive_scale": 9.0, "virtual__friction_negative_scale": 9.0}, MotionFault,
          r"direction: the reading of \[encoder\] stood still .* at up to 60.0 Nm"),
+        ({"virtual__friction_positive_scale": 2.2, "virtual__friction_negative_scale": 2.2}, MotionFault,
+         r"friction: TORQUE_SATURATED .* 34 points are in .*friction.csv"),
         ({"virtual__end_stops": True, "virtual__end_stop_min_rad": -0.3, "virtual__end_stop_max_rad": 0.3}, MotionFault,
          r"response: .*(FOLLOWING_ERROR|TORQUE_SATURATED|POSITION_FROZEN|LIMIT_CYCLE)"),
     ],

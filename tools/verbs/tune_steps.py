@@ -327,10 +327,14 @@ class Tune:
     def _step_gains(self) -> dict[str, Any]:
         self.gains = self._chosen(self.options.law, self.options.objective)
         self._require(self.gains)
-        best = self.gains.best
+        return self._kept(self.gains)
+
+    @staticmethod
+    def _kept(gains: ChosenGains) -> dict[str, Any]:
+        best = gains.best
         return {
-            "law": self.gains.law, "control": self.gains.control.model_dump(mode="json", exclude_none=True),
-            "missed": self.gains.missed, "phase_margin_deg": best.phase_margin_deg, "gain_margin": best.gain_margin,
+            "law": gains.law, "control": gains.control.model_dump(mode="json", exclude_none=True),
+            "missed": gains.missed, "phase_margin_deg": best.phase_margin_deg, "gain_margin": best.gain_margin,
             "sensitivity": best.sensitivity, "noise_Nm": best.noise_Nm,
         }  # fmt: skip
 
@@ -393,9 +397,9 @@ class Tune:
     def _refine(self) -> None:
         """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
         gains = self.gains or self._chosen(self.options.law, self.options.objective)
-        best, error = gains.best, self.state["verification"]["after"]["rmse_mrad"]
+        error = self.state["verification"]["after"]["rmse_mrad"]
         allowed = [one for one in gains.tried if one.stable and not gains.missed_by(one)]
-        tried, runs = [best], list[dict[str, Any]]()
+        tried, runs = [gains.best], list[dict[str, Any]]()
         for one in sorted(allowed, key=lambda one: one.error):
             if len(runs) == REFINE_RUNS:
                 break
@@ -407,7 +411,8 @@ class Tune:
                 self.carrier.output.note(f"  kv {one.settings.kv:g}: {found.get('rmse_mrad', math.inf):.4f} mrad")
                 if found.get("rmse_mrad", math.inf) < REFINE_BETTER * error:
                     error, self.config = found["rmse_mrad"], self._with_control(control)
-                    self.state["gains"]["control"] = control.model_dump(mode="json", exclude_none=True)
+                    self.gains = replace(gains, best=one, missed={}, control=control)
+                    self.state["gains"] = self._kept(self.gains)
                     self.state["verification"]["after"] = found
         self.state["refinement"] = {"runs": runs}
         self._save()
