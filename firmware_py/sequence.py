@@ -106,6 +106,7 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
     """WAITING: some good samples at standstill inside the limits, then ask the drive to enable."""
     limits = constants.limits
     moving = not abs(state.velocity.velocity_radps) <= limits.standstill_radps
+    noise = moving and state.ready != 0  # it waited for another one, who is the cause if that never comes
     state.ready = 0
     if state.good_samples >= constants.sequence.settle_cycles:
         position_rad = limit_position_rad(limits, state.measured_position_rad, state.second_position_rad)
@@ -121,7 +122,7 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             if state.held_back == 0:
                 enter(state, AxisPhase.ENABLING)
             return
-    if waited_too_long(state, constants.sequence.wait_max_cycles):
+    if waited_too_long(state, constants.sequence.wait_max_cycles) and not noise:
         if state.sample_count == 0:
             trip(state, Fault.NO_SAMPLES, 0.0, sample.drive_error)
         elif sample.drive_state == DriveState.ENABLED:

@@ -172,6 +172,19 @@ def test_waiting_ends(
     assert state.fault_drive_error == (0 if fault is Fault.NOT_AT_STANDSTILL else 0x3310)
 
 
+@pytest.mark.parametrize(("ready", "velocity_radps", "fault"), [
+    (0, 0.5, Fault.NOT_AT_STANDSTILL), (1, 0.5, Fault.NONE), (1, 0.0, Fault.NONE), (0, 0.0, Fault.NONE),
+])  # fmt: skip
+def test_a_noisy_reading_of_a_joint_that_waits_for_another_is_not_the_cause(
+    axis: Any, state: Any, ready: int, velocity_radps: float, fault: Fault
+) -> None:
+    settled(state, 0.0, velocity_radps)
+    state.phase_cycle, state.held_back, state.ready = 41, 1, ready
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert state.fault == fault
+    assert state.ready == (velocity_radps == 0.0)
+
+
 @pytest.mark.parametrize(("phase", "wait_cycles"), [(AxisPhase.WAITING, 40), (AxisPhase.ENABLING, 30)])
 @pytest.mark.parametrize("samples", [0, 3])
 def test_a_wait_that_is_over_only_because_the_loop_was_held_up_says_so(
