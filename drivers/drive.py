@@ -9,6 +9,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.kernel import kernel
+
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
 Approval = Callable[[str], bool]  # of a question, by the user
 SAFE_STATES = ("switch on disabled", "fault", "off")
@@ -194,3 +197,74 @@ def common_state(names: Sequence[str], states: Sequence[str]) -> str:
         if state != UNTOUCHED and not is_safe(state)
     ]  # fmt: skip
     return "; ".join(powered) if powered else ", ".join([off[0], *differing])
+
+
+# --- Position counters of 32 bits that run over, as every drive reports them ---
+
+WRAP = 1 << 32
+HALF_WRAP = 1 << 31
+
+
+class PositionCounter(Protocol):
+    """What any driver's record has of it."""
+
+    primed: int
+    last_counts: int  # as received
+    counts: int  # unwrapped
+
+
+@kernel
+def take_counts(port: PositionCounter, counts: int) -> None:
+    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
+    if port.primed == 0:
+        port.primed = 1
+        port.counts = counts
+    else:
+        step = counts - port.last_counts
+        if step >= HALF_WRAP:
+            step -= WRAP
+        elif step < -HALF_WRAP:
+            step += WRAP
+        port.counts += step
+    port.last_counts = counts
+
+
+# --- A drive that is under power before anything was sent to it: may it be braked? ---
+#
+# A silent line does not prove that no one controls it: a drive may hold a position, or follow a profile, by itself.  So
+# one that turns is left alone; one at rest is braked only when the user has agreed.
+
+WATCH_S = 0.5
+WATCH_EACH_S = 0.05
+REST_COUNTS, REST_rad = 2, 1e-4  # an enabled joint at rest may move by so much, whichever is more
+STOP_HINT = "`jointctl stop` brakes it and switches it off"
+
+
+def refuse_unless_at_rest(
+    place: str, read_counts: Callable[[], int], rad_per_count: float, approve: Approval | None, question: str,
+    pause: Callable[[float], None], refuse_others: Callable[[], None] = lambda: None,
+) -> None:  # fmt: skip
+    """Returns when the joint is at rest and `approve` has agreed to the question.
+
+    `place` names the drive and its state; `approve` None: it must not be touched.  Raises `DeviceError` for a drive
+    that turns or is not to be touched, `Declined` for a no, and what `refuse_others` raises.
+    """
+
+    def watch() -> None:
+        readings = [read_counts()]
+        for _ in range(round(WATCH_S / WATCH_EACH_S)):
+            pause(WATCH_EACH_S)
+            readings.append(read_counts())
+        refuse_others()
+        turned = max(readings) - min(readings)
+        if turned > max(REST_COUNTS, REST_rad / abs(rad_per_count)):
+            text = f"{place} and turns ({turned} counts in {WATCH_S:g} s): {left_alone}"
+            raise DeviceError(text, STOP_HINT)
+
+    left_alone = "another controller may have it, and it was left as it is"
+    watch()
+    if approve is None:
+        raise DeviceError(f"{place}: {left_alone}", STOP_HINT)
+    if not approve(question):
+        raise Declined
+    watch()  # the answer may have taken minutes

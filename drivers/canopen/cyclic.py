@@ -24,7 +24,7 @@ import numpy as np
 from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
 from jointctl.drivers.canopen.cia402 import State, control_word, decode_state, drive_state
 from jointctl.drivers.canopen.identifiers import NmtState
-from jointctl.drivers.position_counts import HALF_WRAP, WRAP, take_counts
+from jointctl.drivers.drive import HALF_WRAP, WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import INT32_MAX, array_of, f8, i4, i8, record, u1, u4

@@ -24,6 +24,7 @@ from typing import Annotated
 
 import numpy as np
 
+from jointctl.drivers.drive import WRAP, take_counts
 from jointctl.drivers.elmo.codes import (
     AMPLIFIER_MASK,
     CR,
@@ -42,7 +43,6 @@ from jointctl.drivers.elmo.codes import (
     UnitMode,
 )
 from jointctl.drivers.elmo.settings import BITS_PER_CHARACTER
-from jointctl.drivers.position_counts import WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import LINE_GONE, Command, Sample
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u1

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from jointctl.drivers.at_rest import refuse_unless_at_rest
-from jointctl.drivers.drive import Approval, CommissioningReport, DriveIdentity
+from jointctl.drivers.drive import Approval, CommissioningReport, DriveIdentity, refuse_unless_at_rest
 from jointctl.drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,

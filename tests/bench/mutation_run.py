@@ -38,7 +38,7 @@ TESTS = {  # below UNIT_TESTS
         "drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off", "drivers/canopen/test_arm_drives",
         "drivers/canopen/test_commissioning",
     ),
-    "drivers/at_rest.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_drive"),
+    "drivers/drive.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_drive"),
     "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/watchdog.py": ("drivers/canopen/test_watchdog", "drivers/canopen/test_switch_off"),
     "drivers/canopen/commissioning.py": (

@@ -14,12 +14,18 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.at_rest import refuse_unless_at_rest
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia402 import State
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
-from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
+from jointctl.drivers.drive import (
+    UNTOUCHED,
+    CommissioningReport,
+    Declined,
+    DriveIdentity,
+    is_safe,
+    refuse_unless_at_rest,
+)
 from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
