@@ -1,10 +1,12 @@
-"""One cycle of the control loop, for all axes at once: the same function in real time, in plain Python and in lockstep.
+"""One cycle of the control loop, for all axes at once, and the fixed-rate loop around it.
+
+The cycle is the same function in real time, in plain Python and in lockstep.
 
     receive -> samples -> suspension, stop word, sign of life -> desired motions -> arm -> laws -> send -> log records
 
 What differs is handed in: an `Exchange` moves frames or bytes, a `Clock` gives the time, and the front end decides when
-a cycle begins (`Slot`).  Front ends: `firmware_py.realtime` on a descriptor, the same loop in plain Python over
-python-can (`tools.session.portable_loop`), and simulated time (`hil.lockstep`).
+a cycle begins (`Slot`).  Front ends: `run_loop` on a descriptor, the same loop in plain Python over python-can
+(`tools.session.portable_loop`), and simulated time (`hil.lockstep`).
 
 Every array of records has one element an axis.  The axes share SYNC, stop word, start and end: none is enabled before
 all can be, none gets torque before all are enabled, whatever brakes one brakes the others in the same cycle, and torque
@@ -22,7 +24,7 @@ import numpy as np
 from jointctl.firmware_py.arm_model import Arm, feed_arm, no_arm
 from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.kernel import inlined, kernel, shared
-from jointctl.firmware_py.libc import load_acquire, store_release
+from jointctl.firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.safety import check_suspension
 from jointctl.firmware_py.schema import INT32_MAX
@@ -306,3 +308,68 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
                 commands[axis].request = DriveRequest.PREPARE
     exchange.send(exchange.link, samples, commands)
     return log_cycle(memory, slot, waited_ns, clock.now_ns(memory.timespec))
+
+
+# --- The fixed-rate loop: one compiled function from before enabling until every drive is off ---
+#
+#     sleep until the absolute deadline -> step_cycle
+#
+# No Python object is touched inside, no memory is allocated, the GIL is not held.  An overrun skips slots and keeps
+# the phase of the schedule; it never sends a burst.  The loop ends by itself when every axis is FINISHED.
+
+
+@kernel
+def slept_ns(words: np.ndarray, timespec: np.ndarray) -> int:
+    """How long the computer has slept since ASLEEP_NS was written; 0 there: since the first call.
+
+    CLOCK_MONOTONIC stands still then, so that no deadline shows it.  Between two readings the processor may be
+    lost: with this order the slept time then seems shorter, never longer, and the next cycle sees it.
+    """
+    before_ns = load_word(words, Word.ASLEEP_NS)
+    if before_ns == 0:
+        start_ns = monotonic_ns(timespec)
+        store_word(words, Word.ASLEEP_NS, boottime_ns(timespec) - start_ns)
+        return 0
+    boot_ns = boottime_ns(timespec)
+    return boot_ns - monotonic_ns(timespec) - before_ns
+
+
+@shared
+def run_cycles(
+    memory: CycleMemory,
+    exchange: Exchange,
+    clock: Clock,
+    sleep_until_ns: Callable[[int, np.ndarray], None],
+    period_ns: int,
+    receive_ns: int,
+    max_cycles: int,
+) -> int:
+    """Run until FINISHED or `max_cycles` slots; returns the number of cycles executed.
+
+    `sleep_until_ns` (deadline_ns, timespec) waits; `receive_ns` is how long a cycle may wait for its sample, counted
+    from the deadline.  In plain Python this is the portable loop.
+    """
+    executed = 0
+    last_slot_ns = clock.now_ns(memory.timespec)
+    deadline_ns = last_slot_ns + period_ns
+    while executed < max_cycles:
+        sleep_until_ns(deadline_ns, memory.timespec)
+        wake_ns = clock.now_ns(memory.timespec)
+        late_ns = wake_ns - deadline_ns
+        if late_ns >= period_ns:
+            deadline_ns += late_ns // period_ns * period_ns
+        elapsed_cycles = (deadline_ns - last_slot_ns) // period_ns
+        last_slot_ns = deadline_ns
+        slot = Slot(period_ns, deadline_ns, wake_ns, late_ns, elapsed_cycles, deadline_ns + receive_ns)
+        executed += 1
+        if step_cycle(memory, exchange, clock, slot):
+            break
+        deadline_ns += period_ns
+    return executed
+
+
+@kernel
+def run_loop(memory: CycleMemory, exchange: Exchange, period_ns: int, receive_ns: int, max_cycles: int) -> int:
+    """`run_cycles` on the computer's clock.  With max_cycles = 0 nothing is sent: that call compiles."""
+    clock = Clock(monotonic_ns, slept_ns)
+    return run_cycles(memory, exchange, clock, sleep_until_ns, period_ns, receive_ns, max_cycles)

@@ -15,7 +15,6 @@ from jointctl.firmware_py.flexible_joint import (
 )
 from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
 from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
-from jointctl.firmware_py.kalman import step_kalman
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import (
@@ -34,6 +33,7 @@ from jointctl.firmware_py.records import (
 )
 from jointctl.firmware_py.states import ControllerKind, FeedForward
 from jointctl.firmware_py.trajectory import Repetition
+from jointctl.firmware_py.velocity import step_kalman
 
 # --- PID on the joint's inertia, the honest baseline: no model but J ---
 # tau = J (q_d'' - kd e' - kp e - ki int(e) dt)

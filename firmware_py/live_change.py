@@ -17,7 +17,6 @@ import math
 
 import numpy as np
 
-from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_learning, right_column_of_p
 from jointctl.firmware_py.motion_records import (
@@ -42,6 +41,7 @@ from jointctl.firmware_py.trajectory import (
     reference_at,
     trapezoid_times_s,
 )
+from jointctl.firmware_py.velocity import set_kalman_gains
 
 REST_radps = 1e-9  # what rounding leaves of the velocity at a crest
 _LONGEST_s = 1e9

@@ -1,15 +1,16 @@
-"""Velocity from position differences with a first-order low-pass.
+"""Velocity of a joint from readings of its position: differences with a first-order low-pass, or a Kalman filter.
 
-The filter lags, and a velocity error e' = filter(q') - q_d' then carries the lag of q' but not of q_d', which an
+The low-pass lags, and a velocity error e' = filter(q') - q_d' then carries the lag of q' but not of q_d', which an
 integrating law absorbs as a bias.  `error_rate_radps` is the matched version: the difference quotient of e = q - q_d
-sent as a whole through the same filter."""
+sent as a whole through the same filter.
+"""
 
 from __future__ import annotations
 
 import math
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import VelocityConstants, VelocityState
+from jointctl.firmware_py.records import ObserverConstants, ObserverState, VelocityConstants, VelocityState
 
 
 @kernel
@@ -39,3 +40,81 @@ def step_velocity(
         state.error_rate_radps += gain * ((error_rad - state.last_error_rad) / interval_s - state.error_rate_radps)
     state.last_position_rad = position_rad
     state.last_error_rad = error_rad
+
+
+# --- Error, its rate and a disturbance by a Kalman filter: for an encoder too coarse for differences ---
+#
+#     e'' = (u - d) / J,   d' = noise        u: torque of feedback and observer that is at work
+#     prediction over one period T:  e- = e + T e' + T^2 a / 2,   e'- = e' + T a,   a = (u - d) / J
+#     correction by the reading:     r = (q - q_d) - e-,   e += g1 r,   e' += g2 r,   d -= J g3 r
+#
+# Between two counts the model of the joint goes on; what was fed forward is taken to cancel what it was meant for.  The
+# gains are those of the steady state for noise of the torque, white and wandering, and of the reading: the intensities
+# enter as two bandwidths, `cutoff_Hz` of the velocity and `bandwidth_radps` of the disturbance,
+#
+#     w = 2 pi cutoff = (torque noise / reading noise)^(1/4),   L = bandwidth = (wandering / white)^(1/2)
+#     spectrum of the reading = 0:   x^3 + w^4 x - w^4 L^2 = 0,   x = s^2, of which the left half plane counts
+#
+# Its poles are near -L and w exp(+-i 135 deg).  Not modelled: the noise of a count is uniform, not Gaussian; the lag of
+# the current loop; an overrun, in which the error moves on by one period only.
+
+_ROUNDS = 60  # of Newton's method, which begins above the root of a convex function: it never fails
+
+
+@kernel
+def kalman_gains(cutoff_Hz: float, bandwidth_radps: float, period_s: float) -> tuple[float, float, float]:
+    """(g1, g2 [1/s], g3 [1/s^2]) of the steady state; both bandwidths > 0."""
+    fourth = (2.0 * math.pi * cutoff_Hz) ** 4
+    x = bandwidth_radps**2
+    for _ in range(_ROUNDS):
+        step = (x * x * x + fourth * (x - bandwidth_radps**2)) / (3.0 * x * x + fourth)
+        x -= step
+        if step <= 1e-15 * x:
+            break
+    # the other two are -x/2 +- i y; their square roots in the left half plane are -a +- i b
+    y = math.sqrt(0.75 * x * x + fourth)
+    a = math.sqrt(0.5 * (math.sqrt(x * x + fourth) - 0.5 * x))
+    b = 0.5 * y / a
+    real = math.exp(-math.sqrt(x) * period_s)
+    pair, product = 2.0 * math.exp(-a * period_s) * math.cos(b * period_s), math.exp(-2.0 * a * period_s)
+    # the characteristic polynomial of prediction and correction has these three roots
+    first, second, third = real + pair, real * pair + product, real * product
+    g1 = 1.0 - third
+    g2 = 0.5 * (6.0 - first - second - 3.0 * g1)
+    g3 = second - first + g1
+    return g1, g2 / period_s, g3 / (period_s * period_s)
+
+
+@kernel
+def set_kalman_gains(constants: ObserverConstants, period_s: float) -> None:
+    """Put the gains of the configured bandwidths into force."""
+    constants.error_gain, constants.rate_gain_1ps, constants.disturbance_gain_1ps2 = kalman_gains(
+        constants.cutoff_Hz, constants.bandwidth_radps, period_s
+    )
+
+
+@kernel
+def step_kalman(
+    constants: ObserverConstants,
+    state: ObserverState,
+    applied_torque_Nm: float,
+    error_rad: float,
+    inertia_kgm2: float,
+    period_s: float,
+) -> float:
+    """Take the error that the encoder shows; the disturbance [Nm] as that of `law.step_observer`.
+
+    `applied_torque_Nm` is what feedback and observer asked for and the joint was given in the period before.
+    """
+    if state.primed == 0:
+        state.primed = 1
+        state.error_rad = error_rad
+        state.error_rate_radps = 0.0
+        return state.disturbance_Nm
+    acceleration = (applied_torque_Nm - state.disturbance_Nm) / inertia_kgm2
+    expected = state.error_rad + period_s * (state.error_rate_radps + 0.5 * period_s * acceleration)
+    apart = error_rad - expected
+    state.error_rad = expected + constants.error_gain * apart
+    state.error_rate_radps += period_s * acceleration + constants.rate_gain_1ps * apart
+    state.disturbance_Nm -= inertia_kgm2 * constants.disturbance_gain_1ps2 * apart
+    return state.disturbance_Nm

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 UNIT_TESTS = ROOT / "tests" / "unit"
 TESTS = {  # below UNIT_TESTS
     "firmware_py/safety.py": ("firmware_py/axis/test_*",),
-    "firmware_py/own_loop.py": ("firmware_py/axis/test_own_loop*",),
+    "firmware_py/axis.py": ("firmware_py/axis/test_own_loop*", "firmware_py/axis/test_axis*"),
     "firmware_py/swing.py": ("firmware_py/axis/test_axis_swing*",),
     "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),

@@ -34,11 +34,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from jointctl.firmware_py.kalman import kalman_gains
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.firmware_py.velocity import kalman_gains, low_pass_gain
 
 # --- the plant between two samples ---
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
@@ -25,7 +24,7 @@ from jointctl.firmware_py.states import (
     ZeroSpeedRule,
 )
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
-from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.firmware_py.velocity import low_pass_gain, set_kalman_gains
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.control_section import Adaptation, Control

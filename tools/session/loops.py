@@ -66,7 +66,7 @@ def loop_call(driver: ModuleType, block: SharedBlock, period_ns: int, receive_ns
 
     0 only compiles, or loads from the cache.
     """
-    from jointctl.firmware_py.realtime import run_loop
+    from jointctl.firmware_py.cycle import run_loop
 
     memory, exchange = block.memory(), Exchange(driver.receive, driver.send, driver.link_of(block.port))
     return lambda max_cycles: int(run_loop(memory, exchange, period_ns, receive_ns, max_cycles))

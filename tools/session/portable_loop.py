@@ -44,9 +44,8 @@ from jointctl.drivers.canopen.cyclic import (
     note_wake,
 )
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.cycle import Clock, Exchange, Histogram
+from jointctl.firmware_py.cycle import Clock, Exchange, Histogram, run_cycles, slept_ns
 from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
-from jointctl.firmware_py.realtime import run_cycles, slept_ns
 from jointctl.firmware_py.schema import INT32_MAX, new
 from jointctl.firmware_py.states import DriveRequest
 from jointctl.tools.session.loop_memory import QUANTILE, SharedBlock, quantile_s

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
 from jointctl.firmware_py.motion_records import Reference
@@ -19,7 +18,7 @@ from jointctl.firmware_py.records import LawConstants, LawState, VelocityConstan
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
+from jointctl.firmware_py.velocity import low_pass_gain, set_kalman_gains, step_velocity
 from jointctl.hil.plant import plant, step_plant
 from jointctl.hil.plant_records import DELAY_SLOTS
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, sampled_joint

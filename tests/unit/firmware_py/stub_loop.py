@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Word
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Word, run_loop
 from jointctl.firmware_py.kernel import exported, record_array_type
 from jointctl.firmware_py.libc import monotonic_ns, store_release
-from jointctl.firmware_py.realtime import run_loop
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis

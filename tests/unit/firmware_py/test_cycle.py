@@ -300,8 +300,8 @@ CALLERS = {  # `axis.step_axis` puts the parts together for the tests of one axi
     "sense_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
     "move_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
     "command_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"}, "write_log": {"firmware_py/cycle.py"},
-    "check_suspension": {"firmware_py/cycle.py"}, "step_cycle": {"firmware_py/realtime.py", "hil/lockstep.py"},
-    "run_cycles": {"firmware_py/realtime.py", "tools/session/portable_loop.py"},
+    "check_suspension": {"firmware_py/cycle.py"}, "step_cycle": {"firmware_py/cycle.py", "hil/lockstep.py"},
+    "run_cycles": {"firmware_py/cycle.py", "tools/session/portable_loop.py"},
 }  # fmt: skip
 
 

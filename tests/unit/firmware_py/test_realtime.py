@@ -193,7 +193,7 @@ def driver_run(cycles):
     from jointctl.drivers.canopen.cyclic import CanopenPort
     from jointctl.firmware_py.cycle import Exchange
     from jointctl.firmware_py.schema import new
-    from jointctl.firmware_py.realtime import run_loop
+    from jointctl.firmware_py.cycle import run_loop
     global link, memory
     if "link" not in globals():
         port = new(CanopenPort)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.cycle import SUSPENDED_MIN_NS, WORDS, Word
-from jointctl.firmware_py.realtime import slept_ns
+from jointctl.firmware_py.cycle import SUSPENDED_MIN_NS, WORDS, Word, slept_ns
 from jointctl.firmware_py.records import AxisState
 from jointctl.firmware_py.safety import check_suspension, reaction_to
 from jointctl.firmware_py.schema import new
