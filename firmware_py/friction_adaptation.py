@@ -25,9 +25,8 @@ from __future__ import annotations
 
 from jointctl.firmware_py.flexible_joint import sine_of_turns
 from jointctl.firmware_py.friction import UNLOADED, Condition, step_lugre
-from jointctl.firmware_py.friction_records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import LawConstants
+from jointctl.firmware_py.records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState, LawConstants
 
 STIFFNESS = (0.4, 1.0, 3.0, 30.0)  # of the bristles, times the configured one; the last ones hardly give way
 AS_CONFIGURED = 1  # their number

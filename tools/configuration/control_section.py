@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from jointctl.firmware_py.friction_records import RIPPLES
-from jointctl.firmware_py.records import NEURONS
+from jointctl.firmware_py.records import NEURONS, RIPPLES
 from jointctl.tools.configuration.sections import Rule, Section, between, is_number, numbers
 
 CENTRES = "15 numbers or 15 pairs [rad, rad/s], each in [-100..100]"

@@ -21,8 +21,7 @@ from jointctl.firmware_py.friction_adaptation import (
     reset_adaptation,
     take_at_rest,
 )
-from jointctl.firmware_py.friction_records import BRISTLES, AdaptationState, LuGreConstants
-from jointctl.firmware_py.records import LawConstants
+from jointctl.firmware_py.records import BRISTLES, AdaptationState, LawConstants, LuGreConstants
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
