@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.can.channel import split_channel
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
+from jointctl.drivers.can.open import split_channel
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError, DeviceError

@@ -16,8 +16,7 @@ from typing import Annotated, Any, Literal, TypeGuard
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
-from jointctl.drivers.can.open import CYCLIC_INTERFACES
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, NAME, RESERVED, split_channel, with_options
 
 
 def is_number(value: object) -> TypeGuard[float]:

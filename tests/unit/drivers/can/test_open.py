@@ -26,8 +26,15 @@ import drivers
 from jointctl.drivers.bus_lock import lock_name
 from jointctl.drivers.can import open as open_module
 from jointctl.drivers.can import socketcan, virtual_bus
-from jointctl.drivers.can.channel import NAME, port_path, split_channel, with_options
-from jointctl.drivers.can.open import normalised, open_cyclic_end, open_python_can
+from jointctl.drivers.can.open import (
+    NAME,
+    normalised,
+    open_cyclic_end,
+    open_python_can,
+    port_path,
+    split_channel,
+    with_options,
+)
 from jointctl.drivers.can.virtual_bus import VirtualBus
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.hil.virtual_bus import VirtualBusHub
