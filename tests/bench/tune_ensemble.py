@@ -30,8 +30,7 @@ sys.path.insert(0, str(ROOT))
 
 from jointctl.drivers.errors import JointctlError  # noqa: E402
 from jointctl.firmware_py.states import Encoders  # noqa: E402
-from jointctl.tools.analysis.linear_loop import TwoMasses  # noqa: E402
-from jointctl.tools.analysis.loop_settings import loop_settings  # noqa: E402
+from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import Fault, Notice
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.control_section import Learning

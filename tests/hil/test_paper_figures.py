@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import StudyResult, StudySettings, quantile, run_study

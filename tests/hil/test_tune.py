@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MotionFault, UsageError
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings

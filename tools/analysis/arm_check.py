@@ -15,8 +15,7 @@ from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import reference_at
-from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import cycle_bytes

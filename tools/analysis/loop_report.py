@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop
-from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
+from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import torque_constant_NmpA

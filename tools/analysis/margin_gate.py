@@ -15,8 +15,7 @@ import numpy as np
 
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings, loop_settings
 from jointctl.tools.analysis.margins import (
     OBSERVING,
     Convergence,

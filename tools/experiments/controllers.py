@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.flexible_gains import chosen_gains
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config

@@ -20,7 +20,7 @@ from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, Gains,
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, TrajectoryKind, in_words
 from jointctl.firmware_py.trajectory import peak_of
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.checks import extremes_problems, problems_between_sections

@@ -34,9 +34,10 @@ from jointctl.tools.analysis.linear_loop import (
     LoopSettings,
     TwoMasses,
     linear_loop,
+    loop_settings,
     sampled_joint,
+    two_masses,
 )
-from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
 from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.control_section import Control, Learning

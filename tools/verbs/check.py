@@ -14,8 +14,7 @@ from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
 if TYPE_CHECKING:
-    from jointctl.tools.analysis.linear_loop import LoopSettings
-    from jointctl.tools.analysis.loop_settings import Assumption
+    from jointctl.tools.analysis.linear_loop import Assumption, LoopSettings
     from jointctl.tools.analysis.margin_gate import Remedy
     from jointctl.tools.analysis.margins import Convergence, Margins, Theory
     from jointctl.tools.configuration.arm import ArmConfig
@@ -42,8 +41,8 @@ def check(
         if figure is not None or choose_gains:
             raise UsageError("--figure and --choose-gains are for one joint's file, not for an arm's")
         return check_arm(config, output, delay_s, allow_low_margin=allow_low_margin)
+    from jointctl.tools.analysis.linear_loop import loop_settings
     from jointctl.tools.analysis.loop_report import contradictions, not_modelled, outside_payload_range
-    from jointctl.tools.analysis.loop_settings import loop_settings
     from jointctl.tools.analysis.margin_gate import (
         learning_of,
         meets,
@@ -107,7 +106,7 @@ def check_cascade(
 ) -> int:
     """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
     from jointctl.tools.analysis.cascade import cascade_margins, cascade_of, cascade_unknowns, require_cascade
-    from jointctl.tools.analysis.loop_settings import loop_settings
+    from jointctl.tools.analysis.linear_loop import loop_settings
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.verbs.bench_drive import bench_of
 

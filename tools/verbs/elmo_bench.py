@@ -241,7 +241,7 @@ def _configured(asked: Asked) -> Config:
 
 def _advice(config: Config) -> str:
     """The rate with the reserve that is kept for the measured line, the cut-off that it allows, and gains."""
-    from jointctl.tools.analysis.loop_settings import loop_settings
+    from jointctl.tools.analysis.linear_loop import loop_settings
 
     drive = elmo_section(config)
     rate_Hz = math.floor(LARGEST_SHARE * highest_rate_Hz(drive.baud_rate_bitps, drive.echo))

@@ -183,7 +183,7 @@ def _lockstep(config: Config) -> tuple[Any, float]:
 
 
 def _late_s(config: Config) -> float:
-    from jointctl.tools.analysis.loop_settings import loop_settings
+    from jointctl.tools.analysis.linear_loop import loop_settings
 
     settings = loop_settings(config)[0]
     return settings.delay_s + settings.lag_s

@@ -20,7 +20,7 @@ from rich.table import Column, Table
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map, map_figure

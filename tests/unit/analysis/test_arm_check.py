@@ -17,8 +17,7 @@ from jointctl.tools.analysis.arm_check import (
     pose_ranges,
     require_budgets,
 )
-from jointctl.tools.analysis.linear_loop import RigidJoint
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import RigidJoint, loop_settings
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.config import Config

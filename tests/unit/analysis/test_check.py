@@ -15,9 +15,8 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.velocity import low_pass_gain
-from jointctl.tools.analysis.linear_loop import CONTROLLERS
+from jointctl.tools.analysis.linear_loop import CONTROLLERS, loop_settings
 from jointctl.tools.analysis.loop_report import not_modelled
-from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm, require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.config import Config

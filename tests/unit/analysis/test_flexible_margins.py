@@ -23,8 +23,7 @@ from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, step_plant
 from jointctl.tools.analysis.flexible_gains import LARGEST_S_ANYWHERE, LARGEST_NOISE_Nm, chosen_gains
-from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop, loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import (
     cases,

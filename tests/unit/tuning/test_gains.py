@@ -9,7 +9,7 @@ import pytest
 import tomlkit
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import plant_settings
