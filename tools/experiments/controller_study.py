@@ -36,8 +36,8 @@ from pydantic_core import PydanticCustomError
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.firmware_py.states import CommandKind
-from jointctl.tools.analysis.cascade import cascade_margins
 from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.margin_gate import cascade_margins
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.child_process import processors
 from jointctl.tools.configuration.config import Config, suggestion

@@ -15,7 +15,7 @@ from typing import Any, Self
 from jointctl.drivers.drive import SettingsGuard
 from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
-from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margin_gate import cascade_text, require_margin
 from jointctl.tools.recording.kept_records import KeptRecords, ThinnedRecords
 from jointctl.tools.recording.ros_messages import frame_array
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
@@ -211,8 +211,6 @@ class RunWatch:
         Where the drive closes its velocity loop by itself, in a sweep, ours is the slow position correction.
         """
         if self.config.drive.own_loop() is not CommandKind.TORQUE:
-            from jointctl.tools.analysis.cascade import cascade_text  # not loaded for another drive
-
             return cascade_text(self.config, delay_s, allow_low_margin=self._allow_low_margin)
         if self._drives_loop_ps is not None:
             margin_deg = math.degrees(0.5 * math.pi - self._drives_loop_ps * delay_s)

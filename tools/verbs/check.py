@@ -105,8 +105,8 @@ def check_cascade(
     config: Config, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False
 ) -> int:
     """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
-    from jointctl.tools.analysis.cascade import cascade_margins, cascade_of, cascade_unknowns, require_cascade
     from jointctl.tools.analysis.linear_loop import loop_settings
+    from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_of, cascade_unknowns, require_cascade
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.verbs.bench_drive import bench_of
 

@@ -12,7 +12,7 @@ import pytest
 from scipy import signal
 
 from jointctl.drivers.errors import MarginError, UsageError
-from jointctl.tools.analysis.cascade import cascade_margins, cascade_text, require_cascade
+from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_text, require_cascade
 from jointctl.tools.configuration.canopen import CanopenSection, cyclic_bus_load, rpdo_bytes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
