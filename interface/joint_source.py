@@ -15,8 +15,8 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, usual_domain
 
 if TYPE_CHECKING:
+    from jointctl.tools.child_process import OwnVirtualJoint
     from jointctl.tools.configuration.arm import ArmConfig
-    from jointctl.tools.own_virtual_joint import OwnVirtualJoint
 
 _NUMBERS = count(1)
 SHIPPED_NAME = "virtual"  # what `Arm` calls the shipped arm
@@ -46,7 +46,7 @@ class Source:
     @contextmanager
     def served(self) -> Iterator[OwnVirtualJoint | None]:
         """With the virtual drives starting, in a process of their own, where they are one's own."""
-        from jointctl.tools.own_virtual_joint import own_virtual_joint
+        from jointctl.tools.child_process import own_virtual_joint
 
         if not self.own_virtual:
             yield None

@@ -35,12 +35,12 @@ from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
 from jointctl.drivers.drive import DriveGroup
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
+from jointctl.tools.child_process import separate_virtual_joint
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
-from jointctl.tools.own_virtual_joint import separate_virtual_joint
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus

@@ -24,7 +24,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from jointctl.tools.own_virtual_joint import separate_virtual_joint  # noqa: E402
+from jointctl.tools.child_process import separate_virtual_joint  # noqa: E402
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log  # noqa: E402
 from tests.configurations import written  # noqa: E402
 

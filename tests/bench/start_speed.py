@@ -19,8 +19,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
+from jointctl.tools.child_process import separate_virtual_joint
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.own_virtual_joint import separate_virtual_joint
 from tests.bench.paired import Row, compared, interleaved, measured
 
 GROUP = "start"

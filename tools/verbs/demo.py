@@ -32,9 +32,9 @@ def demo(
     """Track a trajectory on the virtual joint, or with a virtual arm: no hardware, no set-up."""
     if arm:
         return _demo_of_arm(duration_s, output)
+    from jointctl.tools.child_process import own_virtual_joint
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
-    from jointctl.tools.own_virtual_joint import own_virtual_joint
     from jointctl.tools.verbs.run import tracked
 
     path = config_path(config)
@@ -53,9 +53,9 @@ def demo(
 
 
 def _demo_of_arm(duration_s: float | None, output: Output) -> int:
+    from jointctl.tools.child_process import own_virtual_joint
     from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
     from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.own_virtual_joint import own_virtual_joint
     from jointctl.tools.verbs.run import tracked
     from jointctl.tools.verbs.verb_options import arm_on_bus
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.tools.child_process import BUS, DRIVE
 from jointctl.tools.output import Output
-from jointctl.tools.own_virtual_joint import BUS, DRIVE
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
 

@@ -14,9 +14,9 @@ from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOrArm
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
+    from jointctl.tools.child_process import OwnVirtualJoint
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
-    from jointctl.tools.own_virtual_joint import OwnVirtualJoint
     from jointctl.tools.session.display import Display
     from jointctl.tools.session.plan import RunPlan
 

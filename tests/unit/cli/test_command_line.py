@@ -20,7 +20,7 @@ import typer
 from typer.testing import CliRunner
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools import own_virtual_joint
+from jointctl.tools import child_process
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
@@ -367,7 +367,7 @@ def test_options_of_the_other_kind_are_refused(path: Path, options: dict[str, An
 def test_what_would_not_be_done_is_refused(
     monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
-    monkeypatch.setattr(own_virtual_joint, "own_virtual_joint", lambda *_: pytest.fail("started"))
+    monkeypatch.setattr(child_process, "own_virtual_joint", lambda *_: pytest.fail("started"))
     found = CliRunner().invoke(app, arguments)
     assert words in (found.exception.message if isinstance(found.exception, ConfigurationError) else found.output)
     assert found.exit_code != 0
