@@ -56,7 +56,6 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.recording.kept_records import IN_MEMORY
 from jointctl.tools.recording.ros_messages import (
     CAN_FRAME,
     CAN_TOPIC,
@@ -88,6 +87,8 @@ if TYPE_CHECKING:
 
 
 CHUNK_BYTES = 256 * 1024
+# records that a run keeps besides, 20 MB; an hour at 1 kHz is 1.2 GB, and the supervisor's memory must not grow with it
+IN_MEMORY = 60_000
 INDEX_IN_MEMORY = 8 * 1024  # bytes, half a minute of a run; a longer index waits in a file
 MESSAGE_HEAD = np.dtype(
     [
@@ -527,3 +528,27 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     for file in removed:
         file.unlink()
     return removed
+
+
+class ThinnedRecords:
+    """Holds the last `whole` records back; of what is older it gives every `every`-th one."""
+
+    def __init__(self, every: int, whole: int) -> None:
+        self._every, self._whole = every, whole
+        self._held: Any = np.zeros(0, dtype_of(LogRecord)).view(np.recarray)
+        self._seen = 0  # records that are no longer held
+
+    def take(self, records: np.ndarray) -> Any:
+        """New `records` (array of LogRecord, shape (N,)) in order of time; returns those to be written now."""
+        held = np.concatenate((self._held, records)).view(np.recarray)
+        old = held[: max(0, len(held) - self._whole)]
+        self._held = held[len(old) :]
+        chosen = old[-self._seen % self._every :: self._every]
+        self._seen += len(old)
+        return chosen
+
+    def last(self) -> Any:
+        """Those held back, all of them; nothing is held afterwards."""
+        held, self._held = self._held, self._held[:0]
+        self._seen += len(held)
+        return held

@@ -5,18 +5,23 @@ Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); 
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, TEAL, VIOLET, canvas, save_png
+from jointctl.tools.recording.run_log import IN_MEMORY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -357,3 +362,47 @@ def _mark_fault(axes: np.ndarray, fault: np.ndarray, time_s: np.ndarray) -> None
         name, (at_s, 0.96), xycoords=("data", "axes fraction"), xytext=(-5 if left else 5, 0), fontsize=9,
         textcoords="offset points", ha="right" if left else "left", va="top", color=RED, fontweight="bold",
     )  # fmt: skip
+
+
+class KeptRecords:
+    """Takes arrays of LogRecord in order of time, gives them back as one.  The file is gone when this is closed."""
+
+    def __init__(self, folder: Path, in_memory: int = IN_MEMORY) -> None:
+        self._folder, self._in_memory = folder, in_memory
+        self._parts: list[Any] = []
+        self._count = 0
+        self._file: IO[bytes] | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, records: np.ndarray) -> None:
+        """Keep `records` (array of LogRecord, shape (N,)); `OSError` if the disk is full."""
+        self._count += len(records)
+        self._parts.append(records)
+        if self._file is None and self._count <= self._in_memory:
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 closed in close()
+        for part in self._parts:
+            self._file.write(np.ascontiguousarray(part).tobytes())
+        self._parts.clear()
+
+    def records(self) -> Any:
+        """All of them: record array of LogRecord, shape (N,); of a long run a view of the file, read-only."""
+        if self._file is None:
+            kept = np.concatenate(self._parts) if self._parts else np.zeros(0, dtype_of(LogRecord))
+            return kept.view(np.recarray)
+        self._file.flush()
+        return np.memmap(self._file, dtype_of(LogRecord), mode="r", shape=(self._count,)).view(np.recarray)
+
+    def close(self) -> None:
+        """Let go of the file; arrays that `records` has given stay valid."""
+        if self._file is not None:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
+        self.close()

@@ -16,9 +16,9 @@ from jointctl.drivers.drive import SettingsGuard
 from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import cascade_text, require_margin
-from jointctl.tools.recording.kept_records import KeptRecords, ThinnedRecords
 from jointctl.tools.recording.ros_messages import frame_array
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, ThinnedRecords
+from jointctl.tools.recording.run_summary import KeptRecords
 from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, TemperatureWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Display, EventFinder, Snapshot, phase_name

@@ -19,10 +19,9 @@ from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlEr
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.kept_records import KeptRecords
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
-from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.recording.run_summary import KeptRecords, summarise
 from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals

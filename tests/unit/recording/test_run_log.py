@@ -22,10 +22,10 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.tools.recording import run_log as mcap_file
-from jointctl.tools.recording.kept_records import KeptRecords, ThinnedRecords
 from jointctl.tools.recording.ros_messages import RECORD_TOPIC, event_body, event_from_body, message_definition
-from jointctl.tools.recording.run_log import CHUNK_BYTES, INFO, McapFile, RunLogWriter, message_rows
+from jointctl.tools.recording.run_log import CHUNK_BYTES, INFO, McapFile, RunLogWriter, ThinnedRecords, message_rows
 from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.recording.run_summary import KeptRecords
 from tests.run_records import sample_records
 
 
