@@ -17,8 +17,8 @@ import can
 import canopen
 import pytest
 
-from jointctl.tools.recording.log_export import candump_lines
 from jointctl.tools.recording.ros_messages import frame_array
+from jointctl.tools.recording.run_log_reader import candump_lines
 
 
 def lines(messages: list[can.Message]) -> str:

@@ -110,8 +110,7 @@ def log_export(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="file to write; default: beside the log")] = None,
 ) -> int:
     """The log in another format."""
-    from jointctl.tools.recording.log_export import FORMATS
-    from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.recording.run_log_reader import FORMATS, read_run_log
     from jointctl.tools.written_file import replace_file
 
     if format not in FORMATS:

@@ -17,7 +17,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
-from jointctl.tools.recording.log_export import candump_bytes
 from jointctl.tools.recording.ros_messages import (
     CAN_TOPIC,
     CDR_HEADER,
@@ -30,7 +29,7 @@ from jointctl.tools.recording.ros_messages import (
     joint_states,
 )
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, Event, RunLogWriter, ThinnedRecords
-from jointctl.tools.recording.run_log_reader import RunLog, began_at, read_run_log
+from jointctl.tools.recording.run_log_reader import RunLog, began_at, candump_bytes, read_run_log
 from jointctl.tools.verbs.log import log_info
 from tests.run_records import sample_records
 from tests.sessions import output

@@ -27,7 +27,6 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
 from jointctl.tools.recording.ros_messages import frame_array, stamps_ns
 from jointctl.tools.recording.run_log import (
     MESSAGE_BYTES,
@@ -37,7 +36,7 @@ from jointctl.tools.recording.run_log import (
     remove_oldest,
     require_room,
 )
-from jointctl.tools.recording.run_log_reader import missing_records, read_run_log
+from jointctl.tools.recording.run_log_reader import FORMATS, columns, missing_records, parquet_bytes, read_run_log
 from jointctl.tools.session.bus_watch import FrameRecorder, recording
 from jointctl.tools.session.consent import prepare_log, require_ready
 from jointctl.tools.session.display import EventFinder

@@ -24,10 +24,9 @@ from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import temperature_object
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.recording.log_export import csv_bytes, npz_bytes, table_columns
 from jointctl.tools.recording.report_figures import temperature_figure
 from jointctl.tools.recording.run_log import RunLogWriter
-from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.recording.run_log_reader import csv_bytes, npz_bytes, read_run_log, table_columns
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session import bus_watch as module
 from jointctl.tools.session.bus_watch import STALE_S, BusWatch, TemperatureWatch, bus_watch
