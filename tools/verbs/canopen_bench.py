@@ -92,8 +92,13 @@ class CanopenBench(BenchDrive):
         return monitor_bus(subject, output, selection, ask=options.ask)
 
     def findings(self, config: Config) -> Iterator[Finding]:
-        from jointctl.tools.inspection.adapters import adapters_not_up
-        from jointctl.tools.inspection.health import adapters, bus_budget, drive_finding, interface_state
+        from jointctl.tools.inspection.health import (
+            adapters,
+            adapters_not_up,
+            bus_budget,
+            drive_finding,
+            interface_state,
+        )
 
         yield from adapters(config)
         yield from adapters_not_up(config)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.tools.inspection.adapters import adapters_not_up, plugged_in
+from jointctl.tools.inspection.health import adapters_not_up, plugged_in
 from tests.configurations import changed, shipped
 
 UP, DOWN = "0x40041\n", "0x40080\n"
