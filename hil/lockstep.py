@@ -5,7 +5,7 @@ only bus and clock are replaced: a frame arrives in the instant in which it was 
 computer's own delay is not modelled either: with a synchronous RPDO (transmission type 1) a command takes effect one
 period after the sample it was computed from, as on a real bus whose round trip fits into the period.
 
-With faults (`hil.fault_kinds`) every frame goes through the wire of `hil.faults`; late frames arrive at
+With faults (`hil.faults`) every frame goes through the wire of `hil.faults`; late frames arrive at
 the beginning of a cycle.
 After the axis has finished, the controller is silent, and drive and joint may go on for a while: nobody sends a
 heartbeat then.
@@ -26,8 +26,17 @@ from jointctl.firmware_py.states import StopRequest
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device
-from jointctl.hil.fault_kinds import FaultKind, is_active, kind_active
-from jointctl.hil.faults import clock_step_cycles, collect, hand_over, step_faults, take_due, to_drive
+from jointctl.hil.faults import (
+    FaultKind,
+    clock_step_cycles,
+    collect,
+    hand_over,
+    is_active,
+    kind_active,
+    step_faults,
+    take_due,
+    to_drive,
+)
 from jointctl.hil.plant_records import PlantState
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 

@@ -37,8 +37,16 @@ from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
-from jointctl.hil.fault_kinds import FaultConstants, FaultMemory, fault_memory, no_faults
-from jointctl.hil.faults import append_frame, pass_frame, step_faults, take_due
+from jointctl.hil.faults import (
+    FaultConstants,
+    FaultMemory,
+    append_frame,
+    fault_memory,
+    no_faults,
+    pass_frame,
+    step_faults,
+    take_due,
+)
 from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
@@ -61,7 +69,7 @@ class DeviceMemory(NamedTuple):
     plant_states: Any  # PlantState[N]
     queues: Any  # FrameQueue[N], to the bus
     arm: ArmPlant  # through which the joints of several drives move one another
-    faults: Any  # FaultConstants[N, M], see `hil.fault_kinds`; None = none, and nothing of them is compiled
+    faults: Any  # FaultConstants[N, M], see `hil.faults`; None = none, and nothing of them is compiled
     fault_memories: Any  # FaultMemory[N]
     words: np.ndarray  # int64[WORDS]
     frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch

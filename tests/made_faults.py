@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from jointctl.firmware_py.schema import new
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultConstants, FaultKind
 
 
 def one_fault(

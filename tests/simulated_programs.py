@@ -43,7 +43,7 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.arm_plant import no_arm_plant
 from jointctl.hil.canopen.device_core import advance_together
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind, fault_memory, no_faults
+from jointctl.hil.faults import FaultConstants, FaultKind, fault_memory, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, Scenario, run_lockstep
 from jointctl.hil.lockstep import World as Joint
 from jointctl.hil.virtual_bus import FrameQueue

@@ -27,7 +27,7 @@ from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.arm_plant import ArmPlant
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.fault_kinds import fault_memory, no_faults
+from jointctl.hil.faults import fault_memory, no_faults
 from jointctl.hil.lockstep import (
     NO_POINTS,
     TRUTHS,

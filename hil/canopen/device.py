@@ -101,7 +101,7 @@ def _sdo_frames(node_id: int, responses: list[bytes]) -> list[bytes]:
 class Cia402Device:
     """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels.
 
-    `faults` (FaultConstants[N], see `hil.fault_kinds`) are carried out by `RealtimeDevice`, not by `handle` and
+    `faults` (FaultConstants[N], see `hil.faults`) are carried out by `RealtimeDevice`, not by `handle` and
     `advance`.
     """
 

@@ -20,7 +20,7 @@ from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.hil import virtual_bus
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.fault_kinds import FaultKind, no_faults
+from jointctl.hil.faults import FaultKind, no_faults
 from jointctl.hil.frame_stamps import (
     OLDEST_STAMP_NS,
     SHORTEST_WINDOW_US,

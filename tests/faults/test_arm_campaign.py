@@ -14,7 +14,7 @@ from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.experiments import arm_campaign

@@ -12,7 +12,7 @@ import pytest
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, CommandKind
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments import judge as judge_module

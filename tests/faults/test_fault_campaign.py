@@ -17,7 +17,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config

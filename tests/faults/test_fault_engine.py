@@ -9,8 +9,16 @@ import pytest
 
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.hil.fault_kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
-from jointctl.hil.faults import pass_frame, take_due
+from jointctl.hil.faults import (
+    MAX_FAULTS,
+    FaultConstants,
+    FaultKind,
+    fault_memory,
+    is_active,
+    no_faults,
+    pass_frame,
+    take_due,
+)
 from jointctl.hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.tools.lockstep import LockstepJoint

@@ -8,7 +8,7 @@ import pytest
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.made_faults import one_fault

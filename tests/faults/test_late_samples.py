@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.tools.lockstep import LockstepJoint
 from tests.made_faults import faults_of, one_fault
 

@@ -10,7 +10,7 @@ import pytest
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.configuration.canopen import CanopenSection
 from jointctl.tools.configuration.config import Config

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
-from jointctl.hil.fault_kinds import LOCKSTEP_ONLY, FaultKind
+from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.plant_settings import fault_constants

@@ -11,7 +11,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.hil.arm_plant import ArmPlant, arm_plant
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.faults import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantSettings
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import CanopenSection, canopen_section, eds_path, encoder_eds_path

@@ -460,7 +460,7 @@ Trajectory = Annotated[Sine | MinJerk | Trapezoid | Table | Hold, Field(discrimi
 
 OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
 MAX_FAULTS = 8
-# by their names in `hil.fault_kinds`, which a run on hardware does not load
+# by their names in `hil.faults`, which a run on hardware does not load
 FAULT_KINDS = (
     "frames_lost", "sync_lost", "rpdo_lost", "tpdo_lost", "controller_heartbeat_lost", "drive_heartbeat_lost",
     "rpdo_delayed", "tpdo_delayed", "rpdo_duplicated", "tpdo_duplicated", "rpdo_reordered", "tpdo_reordered",
@@ -478,12 +478,12 @@ def _kind(value: object) -> Any:
 
 
 class VirtualFault(Section):
-    """One fault on purpose; what `magnitude` means for each kind is explained in `hil.fault_kinds`."""
+    """One fault on purpose; what `magnitude` means for each kind is explained in `hil.faults`."""
 
     kind: Annotated[str, BeforeValidator(Rule(FAULT_KINDS_TEXT, _kind))]  # what goes wrong
     at_s: Annotated[float, between(0.0, 1e6)]  # after the power stage is on for the first time
     duration_s: Annotated[float, between(0.0, 1e6, open_low=True)] = 1e6  # how long
-    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0  # its meaning for each kind is in hil/fault_kinds.py
+    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0  # its meaning for each kind is in hil/faults.py
     seed: Annotated[int, between(1, 2**31 - 1)] = 1  # of random ones
 
 

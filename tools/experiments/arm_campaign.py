@@ -34,7 +34,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.analysis.arm_check import pose_models

@@ -25,7 +25,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.firmware_py.velocity import low_pass_gain
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind

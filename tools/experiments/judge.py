@@ -43,7 +43,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import (
     NO_POINTS,
     POINT_VALUES,

@@ -15,7 +15,7 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from jointctl.hil.fault_kinds import fault_memory, no_faults
+from jointctl.hil.faults import fault_memory, no_faults
 from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, Scenario, World, run_lockstep
 from jointctl.hil.virtual_bus import FrameQueue
 from jointctl.tools.lockstep import DirectBus, LockstepJoint, codec_of

@@ -17,7 +17,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.faults import FaultKind
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps

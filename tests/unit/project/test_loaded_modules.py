@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from jointctl.hil.fault_kinds import LOCKSTEP_ONLY, FaultKind
-from jointctl.hil.fault_kinds import MAX_FAULTS as MAX_FAULTS_OF_THE_JOINT
+from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
+from jointctl.hil.faults import MAX_FAULTS as MAX_FAULTS_OF_THE_JOINT
 from jointctl.tools.configuration.sections import FAULT_KINDS, MAX_FAULTS
 from tests.places import CONFIGS
 

@@ -21,7 +21,7 @@ from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.tools.configuration.canopen import canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.inspection.health import bus_budget
