@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.virtual_elmo import serve_virtual_elmo

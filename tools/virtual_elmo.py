@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from jointctl.drivers.errors import DataError
-from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
+from jointctl.hil.elmo_drive import ElmoDeviceSettings, ElmoInterpreter
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.hil.plant import plant
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import elmo_section

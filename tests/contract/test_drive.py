@@ -14,7 +14,7 @@ from jointctl.drivers.drive import Declined, Drive
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.elmo import elmo_settings
 from jointctl.tools.configuration.load import load_config, moved, shipped_config

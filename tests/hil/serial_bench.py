@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.session.elmo_guard import GuardOrder
 from tests.configurations import written
 

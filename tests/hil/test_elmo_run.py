@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo_line import ElmoDevice
 from tests.hil.serial_bench import stick_position
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.friction import friction_curve_Nm
-from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.hil.elmo.motor import MF_POSITION_LIMIT
+from jointctl.hil.elmo_drive import MF_POSITION_LIMIT
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
 from tests.hil.serial_bench import GUARD, LOOP, stick_position

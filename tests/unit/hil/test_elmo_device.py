@@ -23,9 +23,14 @@ from jointctl.drivers.elmo.codes import (
     unit_mode,
 )
 from jointctl.drivers.elmo.dialogue import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
-from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
-from jointctl.hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
+from jointctl.hil.elmo_drive import (
+    MF_OVERSPEED,
+    MF_POSITION_LIMIT,
+    MF_SPEED_ERROR,
+    ElmoDeviceSettings,
+    ElmoInterpreter,
+)
+from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.hil.plant import plant
 
 

@@ -35,7 +35,7 @@ from jointctl.drivers.elmo.exchange import link_of, receive
 from jointctl.firmware_py.records import LINE_GONE, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
-from jointctl.hil.elmo.motor import switch_off
+from jointctl.hil.elmo_drive import switch_off
 from tests.unit.drivers.elmo.virtual_line import PER_RAD, PERIOD_S, RAMP_CPS2, Talk
 
 

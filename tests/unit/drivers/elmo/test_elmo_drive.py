@@ -15,7 +15,7 @@ from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.serial_port import SerialPort
 from jointctl.drivers.elmo.settings import cycle_characters, highest_rate_Hz, measured_exchange
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from jointctl.hil.elmo.motor import switch_off
+from jointctl.hil.elmo_drive import switch_off
 from jointctl.tools.verbs.elmo_bench import SHARED_ATTEMPTS
 from tests.unit.drivers.elmo.virtual_line import COUNTS, SETTINGS, MemoryPort
 

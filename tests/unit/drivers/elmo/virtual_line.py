@@ -14,7 +14,7 @@ from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
-from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
+from jointctl.hil.elmo_drive import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.plant import plant
 
 # --- The virtual drive's interpreter behind a port that is memory, with a time of its own ---

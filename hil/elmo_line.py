@@ -23,7 +23,7 @@ import tty
 from collections import deque
 from dataclasses import dataclass
 
-from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo_drive import ElmoInterpreter
 
 BITS_PER_CHARACTER = 10
 RECEIVE_MAX = 512

@@ -1,1 +1,0 @@
-"""The virtual drive with the ASCII interpreter on a pseudo-terminal."""
