@@ -19,8 +19,17 @@ from jointctl.drivers.elmo.codes import (
     status_text,
 )
 from jointctl.drivers.elmo.cyclic import ElmoPort
-from jointctl.drivers.elmo.dialogue import SAFE_ATTEMPTS, Dialogue, RefusedError, ReplyKind, changed, encode, switch_off
-from jointctl.drivers.elmo.serial_port import BytePort, SerialPort
+from jointctl.drivers.elmo.dialogue import (
+    SAFE_ATTEMPTS,
+    BytePort,
+    Dialogue,
+    RefusedError,
+    ReplyKind,
+    SerialPort,
+    changed,
+    encode,
+    switch_off,
+)
 from jointctl.drivers.elmo.settings import (
     LARGEST_SHARE,
     ElmoSettings,

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from serial.tools import list_ports
 
-from jointctl.drivers.elmo.serial_port import usb_serial_number
+from jointctl.drivers.elmo.dialogue import usb_serial_number
 from jointctl.tools.session.elmo_guard import LineGuard
 from tests.hil.serial_bench import guard_order
 

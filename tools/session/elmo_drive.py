@@ -17,8 +17,8 @@ import numpy as np
 
 from jointctl.drivers.drive import Drive
 from jointctl.drivers.elmo.codes import SERVO_ON, motor_fault_text
+from jointctl.drivers.elmo.dialogue import usb_serial_number
 from jointctl.drivers.elmo.drive import ElmoDrive
-from jointctl.drivers.elmo.serial_port import usb_serial_number
 from jointctl.drivers.elmo.settings import command_time_s
 from jointctl.drivers.errors import BusError, JointctlError
 from jointctl.firmware_py.cycle import WORDS, Histogram, Word

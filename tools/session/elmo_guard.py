@@ -27,8 +27,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from jointctl.drivers.bus_lock import ANSWER_S, listener, may_ask, parsed_line, send_line
-from jointctl.drivers.elmo.dialogue import SWITCH_OFF, Dialogue, switch_off
-from jointctl.drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
+from jointctl.drivers.elmo.dialogue import (
+    SWITCH_OFF,
+    Dialogue,
+    SerialPort,
+    open_descriptor,
+    switch_off,
+    usb_serial_number,
+)
 from jointctl.drivers.errors import BusError, JointctlError
 
 # --- Speaking with the guard of a serial line from another terminal ---

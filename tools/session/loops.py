@@ -176,8 +176,7 @@ def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     loop ends, the drive is commanded to switch off: it would keep its last torque command for ever.
     """
     from jointctl.drivers.elmo import exchange
-    from jointctl.drivers.elmo.dialogue import SWITCH_OFF
-    from jointctl.drivers.elmo.serial_port import open_descriptor
+    from jointctl.drivers.elmo.dialogue import SWITCH_OFF, open_descriptor
 
     call = loop_call(exchange, block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache

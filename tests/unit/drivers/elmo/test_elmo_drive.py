@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from jointctl.drivers.elmo.dialogue import SerialPort
 from jointctl.drivers.elmo.drive import ElmoDrive
-from jointctl.drivers.elmo.serial_port import SerialPort
 from jointctl.drivers.elmo.settings import cycle_characters, highest_rate_Hz, measured_exchange
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.hil.elmo_drive import switch_off
