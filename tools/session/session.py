@@ -22,7 +22,6 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import KeptRecords, summarise
-from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
@@ -31,7 +30,15 @@ from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
 from jointctl.tools.session.plan import Placed, RunPlan, blamed
 from jointctl.tools.session.result import RunResult, warn_unless_off
-from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.session.run_watch import (
+    Around,
+    BusWatch,
+    RunParts,
+    RunWatch,
+    TemperatureWatch,
+    bus_watch,
+    recording,
+)
 from jointctl.tools.session.session_drive import Guard, session_drive
 from jointctl.tools.session.set_points import SetPointSources
 

@@ -28,9 +28,9 @@ from jointctl.tools.recording.report_figures import temperature_figure
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import csv_bytes, npz_bytes, read_run_log, table_columns
 from jointctl.tools.recording.run_summary import summarise
-from jointctl.tools.session import bus_watch as module
-from jointctl.tools.session.bus_watch import STALE_S, BusWatch, TemperatureWatch, bus_watch
+from jointctl.tools.session import run_watch as module
 from jointctl.tools.session.fault_words import fault_text
+from jointctl.tools.session.run_watch import STALE_S, BusWatch, TemperatureWatch, bus_watch
 from tests.configurations import shipped, written
 
 # --- What a sick SocketCAN interface adds to a run: its complaints as they come, its state as the cause of a fault ---

@@ -26,11 +26,10 @@ from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check,
 from jointctl.tools.inspection.motion_check import make_plan as check_plan
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.session.bus_watch import BusWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
-from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.options import SweepOptions, both_directions, ordered_points
 from jointctl.tools.sweeping.plan import PlanSettings, make_plan, plan_motion, require_torque, shifted
