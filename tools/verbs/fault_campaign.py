@@ -9,7 +9,8 @@ import typer
 
 from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import ConfigPath, ManyRuns, Report, VerbOutput, loaded_joint_or_arm
+from jointctl.tools.verbs.study import ManyRuns
+from jointctl.tools.verbs.verb_options import ConfigPath, Report, VerbOutput, loaded_joint_or_arm
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

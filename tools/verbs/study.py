@@ -10,13 +10,34 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import ManyRuns, Report, VerbOutput, configurations
+from jointctl.tools.verbs.verb_options import Report, VerbOutput, configurations
 
 if TYPE_CHECKING:
     from jointctl.tools.experiments.controller_study import StudyResult, StudySettings
     from jointctl.tools.experiments.many_runs import Workers
+
+
+def _workers(
+    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core", min=1)] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", metavar="TCP://HOST:PORT", help="on the workers of a dask scheduler (extra cluster)"),
+    ] = None,
+    cluster_unprotected: Annotated[
+        bool, typer.Option("--cluster-unprotected", help="also without TLS on another computer: docs/cluster.md")
+    ] = False,
+) -> Workers:
+    from jointctl.tools.experiments.many_runs import Workers
+
+    if cluster is not None and workers is not None:
+        raise UsageError("--workers and --cluster exclude each other: the cluster has its own workers")
+    return Workers(workers, cluster, cluster_unprotected, Output().warning)
+
+
+ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried out
+
 
 _COLUMNS = (
     ("peak_mrad", "peak [mrad]"),

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.experiments.many_runs import Workers
 
 # headings of `jointctl --help`
 BEGIN, MOVE, INSPECT, FRICTION = "Begin", "Move a joint", "Look at a bus and a drive", "Friction"
@@ -243,24 +242,6 @@ def _output(json: Json = False, quiet: Quiet = False) -> Output:
     return Output(json=json, quiet=quiet)
 
 
-def _workers(
-    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core", min=1)] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option("--cluster", metavar="TCP://HOST:PORT", help="on the workers of a dask scheduler (extra cluster)"),
-    ] = None,
-    cluster_unprotected: Annotated[
-        bool, typer.Option("--cluster-unprotected", help="also without TLS on another computer: docs/cluster.md")
-    ] = False,
-) -> Workers:
-    from jointctl.tools.experiments.many_runs import Workers
-
-    if cluster is not None and workers is not None:
-        raise UsageError("--workers and --cluster exclude each other: the cluster has its own workers")
-    return Workers(workers, cluster, cluster_unprotected, Output().warning)
-
-
-ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried out
 JointOnBus = Annotated["Config", _loaded]
 JointOrArmOnBus = Annotated["Config | ArmConfig", _loaded_joint_or_arm]
 JointOfFile = Annotated["Config", _loaded_file]
