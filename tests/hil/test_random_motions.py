@@ -12,16 +12,18 @@ from jointctl.firmware_py.trajectory import reference_at, repetition
 from jointctl.tools.experiments.controller_study import EnsembleSettings, checked, random_plant, run_study
 from jointctl.tools.experiments.controllers import controller_constants, named
 from jointctl.tools.experiments.many_runs import Workers
-from jointctl.tools.experiments.random_motions import (
+from jointctl.tools.experiments.scenarios import (
     RANDOM_MOTIONS,
     ACCELERATION_radps2,
     CREEP_radps,
     RandomMotion,
     REACH_rad,
     SPEED_radps,
+    error_figures,
     random_motion,
+    run_scenario,
+    settled_share,
 )
-from jointctl.tools.experiments.scenarios import error_figures, run_scenario, settled_share
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import shipped
 

@@ -64,8 +64,15 @@ from jointctl.tools.experiments.controllers import (
     with_chosen_gains,
 )
 from jointctl.tools.experiments.many_runs import HERE, Workers
-from jointctl.tools.experiments.random_motions import RANDOM_MOTIONS, random_motion
-from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
+from jointctl.tools.experiments.scenarios import (
+    RANDOM_MOTIONS,
+    RPDO_AT_ONCE,
+    ErrorFigures,
+    Scenario,
+    error_figures,
+    random_motion,
+    run_scenario,
+)
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
 

@@ -26,8 +26,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, named
-from jointctl.tools.experiments.random_motions import random_motion
-from jointctl.tools.experiments.scenarios import error_figures, run_scenario
+from jointctl.tools.experiments.scenarios import error_figures, random_motion, run_scenario
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import shipped, written
 
