@@ -53,8 +53,7 @@ from jointctl.tools.tuning.found_values import (
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
 from jointctl.tools.tuning.gains import ChosenGains, choose_gains, trade_off_figure
-from jointctl.tools.tuning.gravity import gravity_of
-from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint
+from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
 from jointctl.tools.tuning.measured_response import measured_response, response_task
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run

@@ -25,8 +25,7 @@ from jointctl.tools.tuning.excitation import (
     speed_and_period,
 )
 from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
-from jointctl.tools.tuning.gravity import gravity_of
-from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint
+from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, gravity_of
 from tests.configurations import shipped
 
 T = 1e-3
