@@ -4,7 +4,7 @@
     frequency  0.35 sin(0.125 pi (t + 1.5)) from 82.5 s on
     amplitude  0.175 sin(0.2 pi t) + 0.175 from 82.5 s on
     load       a load torque of 3 Nm at the joint from 80 s on
-    multi_sine, point_to_point, reversals, creep: motions that never repeat, see `random_motions`
+    multi_sine, point_to_point, reversals, creep: motions that never repeat, see `random_motion`
 
 Both changes of the trajectory come at a crest: position and velocity go on, the acceleration jumps.
 """
