@@ -8,8 +8,19 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from jointctl.tools.scoping.history import SIGNALS, History, crossing_s
-from jointctl.tools.scoping.views import AGAINST, SPECTRUM, TIME, TIME_NAME, VIEWS, Seen, readings, seen
+from jointctl.tools.scoping.history import (
+    AGAINST,
+    SIGNALS,
+    SPECTRUM,
+    TIME,
+    TIME_NAME,
+    VIEWS,
+    History,
+    Seen,
+    crossing_s,
+    readings,
+    seen,
+)
 
 SPANS_s = (2, 5, 10, 30, 60)
 FIRST_SIGNALS = ("desired angle [rad]", "angle [rad]", "command torque [Nm]")

@@ -11,8 +11,18 @@ import pytest
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.tools.scoping.history import POINTS, History
-from jointctl.tools.scoping.views import AGAINST, SPECTRUM, TIME, TIME_NAME, Seen, readings, seen, spectra
+from jointctl.tools.scoping.history import (
+    AGAINST,
+    POINTS,
+    SPECTRUM,
+    TIME,
+    TIME_NAME,
+    History,
+    Seen,
+    readings,
+    seen,
+    spectra,
+)
 
 TIME_s = np.arange(0.0, 5.0, 1e-3)
 SINE = {"angle [rad]": 1.0 + 0.35 * np.sin(math.tau * 7.0 * TIME_s)}
