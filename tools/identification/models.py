@@ -1,6 +1,7 @@
-"""The friction models that can be identified, as linear regressions once Stribeck speed and knee are given.
+"""What can be identified: the friction of a sweep by several models, and the torque of any motion.
 
-Per direction, mirrored, with x = u / top in (0..1] (top = highest speed measured) so that all columns are of order 1:
+The friction models are linear regressions once Stribeck speed and knee are given.  Per direction, mirrored, with
+x = u / top in (0..1] (top = highest speed measured) so that all columns are of order 1:
 
     multi-stage              x <= knee: tc (1 - e) + ts e + tv x,  e = exp(-x / ws);  beyond: c0 P0 + .. + c3 P3   (11)
     multi-stage-continuous   the same with c0 such that both stages meet at the knee (C0)
@@ -14,12 +15,13 @@ parallel and a particle swarm does not find the minimum; in Legendre polynomials
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from jointctl.firmware_py.friction import PrintedBranch, branch_constants, branch_torque_Nm
+from jointctl.firmware_py.friction import DEGREE, PrintedBranch, branch_constants, branch_torque_Nm
 
 MIN_PER_STAGE = 5  # points; a stage has four parameters
 
@@ -154,3 +156,157 @@ def branch(form: Form, beta: np.ndarray, ws: float, knee: float, top_radps: floa
         float(tc), float(ts), float(ws) * top_radps, float(tv) / top_radps, (a[0], a[1], a[2], a[3]),
         knee * top_radps, top_radps,
     )  # fmt: skip
+
+
+# --- Torque of a joint in any motion: inertia, gravity, and friction with its load and temperature ---
+#
+# At the joint, with the speed v, the torque tau that the reducer transmits, and the temperature T:
+#
+#     tau = J a + gs sin q + gc cos q                 without a known load, else  J a + (1 + s) load
+#     motor torque times ratio = tau + sign(v) (C fc + V fv)
+#     C = tc + (ts - tc) exp(-|v| / ws) + kc |tau|            fc = exp(-bc (T - T0))
+#     V = (11) less its Coulomb and Stribeck part + kv |tau| |v|        fv = exp(-bv (T - T0))
+#
+# tc, ts, ws and V belong to a direction, the rest to both.  Friction that goes with |tau| and always opposes the motion
+# is that of the load-dependent models of Rhoban's BAM; beside it, a gear that loses more in one direction of power than
+# in the other looks like an error s of the known load, as sign(v) |tau| and tau span both.  Not modelled: hysteresis,
+# dependence on position, backlash.
+
+WS_MAX_radps = 20.0 * DEGREE
+SIGNS = {"positive": 1, "negative": -1}
+FORM_STEPS = {
+    "coulomb": ("coulomb-viscous", "stribeck"),
+    "coulomb-viscous": ("stribeck",),
+    "stribeck": ("multi-stage-continuous",),
+    "multi-stage-continuous": (),
+}
+TERMS = {
+    "inertia": ("inertia",),
+    "gravity": ("gravity_sin", "gravity_cos"),
+    "load-scale": ("load_scale",),
+    "load-coulomb": ("load_coulomb",),
+    "load-viscous": ("load_viscous",),
+    "temperature-coulomb": ("temperature_coulomb",),
+    "temperature-viscous": ("temperature_viscous",),
+}
+UNITS = {
+    "inertia": "kg m2", "gravity_sin": "Nm", "gravity_cos": "Nm", "load_scale": "", "load_coulomb": "Nm/Nm",
+    "load_viscous": "s/rad", "temperature_coulomb": "1/K", "temperature_viscous": "1/K",
+    "tc": "Nm", "rise": "Nm", "tv": "Nm s/rad", "ws": "rad/s", "c1": "Nm", "c2": "Nm", "c3": "Nm",
+}  # fmt: skip
+BOUNDS = {
+    "tc": (0.0, np.inf), "tv": (0.0, np.inf), "rise": (0.0, np.inf),
+    "load_coulomb": (0.0, 2.0), "load_viscous": (0.0, 2.0),
+    "temperature_coulomb": (-0.2, 0.2), "temperature_viscous": (-0.2, 0.2),
+}  # fmt: skip
+
+EXPERIMENTS = {  # which would tell a parameter that the data leave open
+    "inertia": "accelerate more",
+    "gravity_sin": "move over a larger angle",
+    "gravity_cos": "move over a larger angle",
+    "load_scale": "move under two known loads, both ways",
+    "load_coulomb": "move both ways under two loads or more",
+    "load_viscous": "move at several speeds under two loads or more",
+    "temperature_coulomb": "measure slow motion cold and warm",
+    "temperature_viscous": "measure fast motion cold and warm",
+    "tc": "measure longer, and more speeds",
+    "rise": "move more slowly (near standstill, above --speed-min)",
+    "ws": "move more slowly (near standstill, above --speed-min)",
+    "tv": "move at more speeds, farther apart",
+}
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What the model is computed from, (N,) each."""
+
+    velocity_radps: np.ndarray
+    acceleration_radps2: np.ndarray
+    position_rad: np.ndarray
+    load_Nm: np.ndarray | None
+    warming_K: np.ndarray | None  # above T0
+
+    def part(self, chosen: np.ndarray | slice) -> Samples:
+        load, warming = (None if v is None else v[chosen] for v in (self.load_Nm, self.warming_K))
+        moved = self.velocity_radps[chosen], self.acceleration_radps2[chosen], self.position_rad[chosen]
+        return Samples(*moved, load, warming)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Which terms there are, and the constants that they need."""
+
+    form: Form
+    terms: frozenset[str]
+    directions: tuple[str, ...]  # of the data; a missing one is mirrored
+    top_radps: float
+    knee: float  # of the top speed
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters in the order of the vector; those of a direction as `tc positive`."""
+        shared = [name for term, names in TERMS.items() if term in self.terms for name in names]
+        own = ["rise" if name == "ts" else name for name in self.form.linear_names]
+        own += ["log_ws"] if self.form.stribeck else []
+        return (*shared, *(f"{name} {word}" for word in self.directions for name in own))
+
+    def bounds(self, speed_min_radps: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limit of each parameter."""
+        ws = (np.log(max(speed_min_radps, 1e-4) / 3.0), np.log(max(WS_MAX_radps, speed_min_radps)))
+        pairs = [ws if n.startswith("log_ws") else BOUNDS.get(n.split()[0], (-np.inf, np.inf)) for n in self.names]
+        return np.array([low for low, _ in pairs]), np.array([high for _, high in pairs])
+
+    def transmitted_Nm(self, value: Mapping[str, float], s: Samples) -> np.ndarray:
+        """tau: what the joint needs without friction."""
+        tau = value.get("inertia", 0.0) * s.acceleration_radps2
+        if s.load_Nm is not None:
+            tau = tau + (1.0 + value.get("load_scale", 0.0)) * s.load_Nm
+        elif "gravity" in self.terms:
+            tau = tau + value["gravity_sin"] * np.sin(s.position_rad) + value["gravity_cos"] * np.cos(s.position_rad)
+        return np.asarray(tau)
+
+    def friction_Nm(self, value: Mapping[str, float], s: Samples, tau_Nm: np.ndarray) -> np.ndarray:
+        """Opposing the motion: positive for a positive speed."""
+        speed = np.abs(s.velocity_radps)
+        x = speed / self.top_radps
+        coulomb, rest = np.zeros(len(x)), np.zeros(len(x))
+        for word, sign in SIGNS.items():
+            chosen = sign * s.velocity_radps > 0.0
+            beta, ws = self.own(value, word)
+            decay = np.exp(-x[chosen] / ws) if self.form.stribeck else 0.0
+            coulomb[chosen] = beta[0] + (beta[1] - beta[0]) * decay if self.form.stribeck else beta[0]
+            rest[chosen] = basis(self.form, x[chosen], ws, self.knee) @ beta - coulomb[chosen]
+        coulomb = coulomb + value.get("load_coulomb", 0.0) * np.abs(tau_Nm)
+        rest = rest + value.get("load_viscous", 0.0) * np.abs(tau_Nm) * speed
+        if s.warming_K is not None:
+            coulomb = coulomb * np.exp(-value.get("temperature_coulomb", 0.0) * s.warming_K)
+            rest = rest * np.exp(-value.get("temperature_viscous", 0.0) * s.warming_K)
+        return np.asarray(np.sign(s.velocity_radps) * (coulomb + rest))
+
+    def own(self, value: Mapping[str, float], word: str) -> tuple[np.ndarray, float]:
+        """(linear parameters of a direction in the order of its form, ws of the top speed)."""
+        word = word if word in self.directions else self.directions[0]
+        ws = float(np.exp(value[f"log_ws {word}"])) / self.top_radps if self.form.stribeck else 1.0
+        beta = [value[f"{'rise' if name == 'ts' else name} {word}"] for name in self.form.linear_names]
+        if self.form.stribeck:
+            beta[1] += beta[0]
+        return np.array(beta), ws
+
+    def torque_Nm(self, vector: np.ndarray, s: Samples) -> np.ndarray:
+        """Motor torque times ratio (N,)."""
+        value = dict(zip(self.names, vector, strict=True))
+        tau = self.transmitted_Nm(value, s)
+        return tau + self.friction_Nm(value, s, tau)
+
+
+def jacobian(model: Model, vector: np.ndarray, samples: Samples) -> np.ndarray:
+    """Slopes (N, p) of the torque against each parameter."""
+    step = 1e-6 * np.maximum(np.abs(vector), 1e-2)
+    return np.column_stack([
+        (model.torque_Nm(vector + d, samples) - model.torque_Nm(vector - d, samples)) / (2.0 * d[k])
+        for k, d in enumerate(np.diag(step))
+    ])  # fmt: skip
+
+
+def unit_of(name: str) -> str:
+    return UNITS[name.split()[0]]

@@ -17,20 +17,23 @@ from scipy.optimize import least_squares
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.friction import DEGREE
-from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, branch
-from jointctl.tools.identification.motion_data import Motion, MotionSettings
-from jointctl.tools.identification.motion_model import (
+from jointctl.tools.identification.models import (
     BOUNDS,
     EXPERIMENTS,
     FORM_STEPS,
+    FORMS,
+    MIN_PER_STAGE,
     SIGNS,
     TERMS,
+    Branch,
     Model,
     Samples,
     WS_MAX_radps,
+    branch,
     jacobian,
     unit_of,
 )
+from jointctl.tools.identification.motion_data import Motion, MotionSettings
 
 LEVEL = 0.95
 SAMPLES_PER_BAND = 5.0  # of the fit, for each hertz of the band

@@ -11,8 +11,8 @@ from rich.text import Text
 
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, SERIES, canvas
 from jointctl.tools.identification.identification_report import section_values
+from jointctl.tools.identification.models import SIGNS, Samples, unit_of
 from jointctl.tools.identification.motion_fit import MotionFit
-from jointctl.tools.identification.motion_model import SIGNS, Samples, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,8 +24,7 @@ from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
-from jointctl.tools.identification.models import FORMS
-from jointctl.tools.identification.motion_model import EXPERIMENTS, SIGNS, Model, Samples, jacobian
+from jointctl.tools.identification.models import EXPERIMENTS, FORMS, SIGNS, Model, Samples, jacobian
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
 from jointctl.tools.sweeping.carry_out import sweep_constants
 from jointctl.tools.sweeping.options import check_range
