@@ -16,8 +16,7 @@ from typing import Any
 from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.virtual_elmo import serve_virtual_elmo
-from jointctl.tools.virtual_joint import serve_virtual_joint
+from jointctl.tools.virtual_joint import serve_virtual_elmo, serve_virtual_joint
 
 BEFORE_A_LOOP, BELOW_A_LOOP = 60, 20  # priorities
 COMPILED = ("device", "virtual bus")  # the threads that never hold the interpreter's lock for long

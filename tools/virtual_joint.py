@@ -1,20 +1,25 @@
-"""The virtual joint of a configuration in this process: bus, drive and plant."""
+"""The virtual joint of a configuration in this process: plant, drive, and its bus or serial line."""
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import os
+import re
+import stat
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
 
 import can
 import numpy as np
 
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
-from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import Cia402Device, DeviceRow
 from jointctl.hil.canopen.records import Device
@@ -32,6 +37,9 @@ from jointctl.tools.configuration.plant_settings import (
     fault_constants,
     plant_settings,
 )
+
+if TYPE_CHECKING:
+    from jointctl.hil.elmo_line import ElmoDevice
 
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
@@ -186,3 +194,81 @@ def serve_virtual_joint(
             return
         end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
         yield stack.enter_context(RealtimeDevice(devices, end.fileno(), arm))
+
+
+# --- The virtual joint behind a virtual Elmo drive on a pseudo-terminal, as a configuration describes both ---
+
+
+def new_elmo_device(config: Config) -> ElmoDevice:
+    """The drive with its plant, as the configuration says that the joint truly is; its port is open, nobody serves."""
+    from jointctl.hil.elmo_drive import ElmoDeviceSettings, ElmoInterpreter  # not loaded for another drive
+    from jointctl.hil.elmo_line import ElmoDevice
+    from jointctl.tools.configuration.elmo import elmo_section
+
+    drive = elmo_section(config)
+    settings = ElmoDeviceSettings(
+        maximum_current_A=max(20.0, drive.peak_current_A),
+        counts_per_turn=config.encoder.counts_per_turn,
+        current_sign=drive.torque_direction * config.encoder.direction,
+    )
+    return ElmoDevice(ElmoInterpreter(settings, *plant(**plant_settings(config))), drive.baud_rate_bitps)
+
+
+@contextmanager
+def serve_virtual_elmo(config: Config, link: str | None = None) -> Iterator[ElmoDevice]:
+    """Drive and plant in a thread of this process; `link` is a path that shall point to the port."""
+    with new_elmo_device(config) as device:
+        if link is not None:
+            _make_link(link, device.path)
+        try:
+            yield device
+        finally:
+            # by now it may be that of another program
+            if link is not None and _target(link) == device.path:
+                with contextlib.suppress(OSError):
+                    os.unlink(link)
+
+
+def _target(link: str) -> str:
+    """Where a link points; empty if there is none."""
+    try:
+        return os.readlink(link)
+    except OSError:
+        return ""
+
+
+def _make_link(link: str, port: str) -> None:
+    """`DataError` where anything but the link of an earlier `hil` of this user has the name: it is left alone."""
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            _require_own_link(link)
+            os.unlink(link)
+        os.symlink(port, link)  # never follows or replaces anything
+    except (OSError, ValueError) as error:  # ValueError: a zero in its name
+        raise DataError(f"--link (={link}): cannot be made: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _require_own_link(link: str) -> None:
+    """A link to a pseudo-terminal, which ended with its `hil` or belongs to this user."""
+    hint = "give a name that is free, or remove what is there by hand"
+    found = os.lstat(link)
+    kind = next((words for is_it, words in _KINDS if is_it(found.st_mode)), "a file")
+    if not stat.S_ISLNK(found.st_mode):
+        raise DataError(f"--link (={link}): is {kind}, and only the link of an earlier hil is replaced", hint)
+    target = os.readlink(link)
+    if found.st_uid != os.getuid() or not _PORT.fullmatch(target):
+        raise DataError(f"--link (={link}): is a link to {target} which no hil of yours has made: left as it is", hint)
+    with contextlib.suppress(FileNotFoundError):
+        if os.stat(target).st_uid != os.getuid():
+            raise DataError(f"--link (={link}): is a link to {target}, the terminal of another user", hint)
+
+
+_PORT = re.compile(r"/dev/pts/[0-9]+")
+_KINDS = (
+    (stat.S_ISREG, "a regular file"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+)

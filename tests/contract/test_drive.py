@@ -18,7 +18,7 @@ from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.elmo import elmo_settings
 from jointctl.tools.configuration.load import load_config, moved, shipped_config
-from jointctl.tools.virtual_elmo import serve_virtual_elmo
+from jointctl.tools.virtual_joint import serve_virtual_elmo
 
 
 class Bench(Protocol):

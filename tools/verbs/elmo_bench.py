@@ -200,7 +200,7 @@ class ElmoBench(BenchDrive):
         """See `BenchDrive`; prints the port on stdout."""
         from jointctl.tools.session.control import stop_signals
         from jointctl.tools.verbs.hil import make_realtime, wait_for_end, watched
-        from jointctl.tools.virtual_elmo import serve_virtual_elmo
+        from jointctl.tools.virtual_joint import serve_virtual_elmo
 
         if options.port is not None:
             raise ConfigurationError(

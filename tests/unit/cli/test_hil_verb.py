@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools import virtual_elmo, virtual_joint
+from jointctl.tools import virtual_joint
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.verbs import hil
 from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 from jointctl.tools.verbs.demo import with_patience
-from jointctl.tools.virtual_elmo import _make_link, _target
+from jointctl.tools.virtual_joint import _make_link, _target
 from tests.configurations import shipped
 
 
@@ -29,7 +29,6 @@ from tests.configurations import shipped
 @pytest.mark.parametrize("serial", [False, True])
 def test_only_what_is_compiled_and_runs_becomes_realtime(monkeypatch: pytest.MonkeyPatch, serial: bool) -> None:
     """A compiler under SCHED_FIFO takes a core from every other loop on the computer."""
-    module = virtual_elmo if serial else virtual_joint
     happened: list[str] = []
     given: list[Sequence[int]] = []
 
@@ -52,7 +51,7 @@ def test_only_what_is_compiled_and_runs_becomes_realtime(monkeypatch: pytest.Mon
         given.append(threads)
         return []
 
-    monkeypatch.setattr(module, "serve_virtual_elmo" if serial else "serve_virtual_joint", serve)
+    monkeypatch.setattr(virtual_joint, "serve_virtual_elmo" if serial else "serve_virtual_joint", serve)
     monkeypatch.setattr("jointctl.tools.session.loop_process.become_realtime", realtime)
     monkeypatch.setattr(hil, "_reader_gone", lambda _: True)
     config = load_config(shipped_config("elmo_serial" if serial else "virtual"))
@@ -111,7 +110,7 @@ def test_anything_else_is_left_alone(tmp_path: Path, port: str, kind: str, words
 def test_a_link_of_another_user(tmp_path: Path, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     link = tmp_path / "tty"
     link.symlink_to("/dev/pts/99999")
-    monkeypatch.setattr(virtual_elmo.os, "getuid", lambda: os.lstat(link).st_uid + 1)
+    monkeypatch.setattr(virtual_joint.os, "getuid", lambda: os.lstat(link).st_uid + 1)
     with pytest.raises(DataError, match="which no hil of yours has made"):
         _make_link(str(link), port)
     assert _target(str(link)) == "/dev/pts/99999"
@@ -128,12 +127,12 @@ def test_a_link_that_another_program_has_put_there_meanwhile_stays(
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(virtual_elmo, "new_elmo_device", lambda _: Device())
+    monkeypatch.setattr(virtual_joint, "new_elmo_device", lambda _: Device())
     link = tmp_path / "tty"
-    with virtual_elmo.serve_virtual_elmo(None, str(link)):  # type: ignore[arg-type]
+    with virtual_joint.serve_virtual_elmo(None, str(link)):  # type: ignore[arg-type]
         assert os.readlink(link) == port
     assert not os.path.lexists(link)
-    with virtual_elmo.serve_virtual_elmo(None, str(link)):  # type: ignore[arg-type]
+    with virtual_joint.serve_virtual_elmo(None, str(link)):  # type: ignore[arg-type]
         link.unlink()
         link.write_text("precious")
     assert link.read_text() == "precious"
