@@ -418,7 +418,7 @@ class SequenceConstants:  # times of the run's phases
 
 
 @record
-class VelocityCommandConstants:  # for a drive that closes the velocity loop, or the position loop as well: `own_loop`
+class VelocityCommandConstants:  # for a drive that closes the velocity loop, or the position loop as well: `axis`
     position_gain_ps: f8  # CommandKind.VELOCITY only
     acceleration_max_radps2: f8
     lead_s: f8  # the motion that is desired so much later is sent; 0 = that of now, without torque offset

@@ -12,8 +12,20 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.motion_records import Gains, TrajectoryConstants
-from jointctl.firmware_py.records import NEURONS, AxisConstants
+from jointctl.firmware_py.motion_records import ChangeConstants, Gains, TrajectoryConstants
+from jointctl.firmware_py.records import (
+    NEURONS,
+    AdaptationConstants,
+    AxisConstants,
+    FlexibleConstants,
+    HarmonicSeries,
+    LawConstants,
+    LimitConstants,
+    SequenceConstants,
+    StreamConstants,
+    SwingConstants,
+    VelocityConstants,
+)
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import (
     ControllerKind,
@@ -76,7 +88,7 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     return constants
 
 
-def _fill_own_loop(axis: Any, config: Config) -> None:
+def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
     """What a drive gets that closes its position or velocity loop itself."""
     sent, record = config.drive.sent_with_target(config.loop.rate_Hz), axis.velocity_command
     if sent is None:
@@ -99,7 +111,7 @@ def free_constants(config: Config, start_rad: float) -> Any:
     return constants
 
 
-def expect_client(constants: Any, config: Config) -> None:
+def expect_client(constants: np.recarray, config: Config) -> None:
     """The loop ends the run when the program that commands the joint has been silent for `stream.client_timeout_s`."""
     constants["stream"]["client_timeout_ns"] = round(config.stream.client_timeout_s * 1e9)
 
@@ -132,13 +144,13 @@ def stacked_tables(tables: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([np.pad(table, ((0, rows - len(table)), (0, 0))) for table in tables])
 
 
-def _copy(record: Any, section: Section, *names: str) -> None:
+def _copy(record: object, section: Section, *names: str) -> None:
     """Values that record and section have by the same name, hence in the same unit."""
     for name in names:
         setattr(record, name, getattr(section, name))
 
 
-def _fill_law(law: Any, config: Config) -> None:
+def _fill_law(law: LawConstants, config: Config) -> None:
     control, joint = config.control, config.joint
     law.kind = ControllerKind[control.kind.upper()]
     law.feed_forward = FeedForward[control.feed_forward.upper()]
@@ -185,7 +197,7 @@ def _fill_law(law: Any, config: Config) -> None:
     network.weight_limit = control.weight_limit_Nm
 
 
-def _fill_adaptation(record: Any, adaptation: Adaptation, ratio: float) -> None:
+def _fill_adaptation(record: AdaptationConstants, adaptation: Adaptation, ratio: float) -> None:
     record.enabled = 1
     _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
     record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
@@ -194,7 +206,7 @@ def _fill_adaptation(record: Any, adaptation: Adaptation, ratio: float) -> None:
         record.ripple_turns_prad[i] = ratio * order / math.tau
 
 
-def _fill_flexible(record: Any, config: Config, reducer: Reducer) -> None:
+def _fill_flexible(record: FlexibleConstants, config: Config, reducer: Reducer) -> None:
     """What the law of a flexible joint reads and believes; the others have no use for it."""
     control, ratio = config.control, config.joint.reduction_ratio
     record.encoders = encoders_of_law(config)
@@ -216,7 +228,7 @@ def _fill_flexible(record: Any, config: Config, reducer: Reducer) -> None:
             _fill_series(getattr(record, name), ratio, made)
 
 
-def _fill_series(series: Any, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
+def _fill_series(series: HarmonicSeries, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
     """`waves`: amplitudes, periods a motor turn, phases [rad]."""
     series.count = len(waves[0])
     for i, (amplitude, per_motor_turn, phase_rad) in enumerate(zip(*waves, strict=True)):
@@ -225,7 +237,7 @@ def _fill_series(series: Any, ratio: float, waves: tuple[tuple[float, ...], ...]
         series.phase_turns[i] = phase_rad / math.tau
 
 
-def _fill_velocity(record: Any, config: Config, cutoff_Hz: float) -> None:
+def _fill_velocity(record: VelocityConstants, config: Config, cutoff_Hz: float) -> None:
     record.period_s = period_s(config)
     record.cutoff_Hz = cutoff_Hz
     record.period_gain = low_pass_gain(cutoff_Hz, period_s(config))
@@ -244,7 +256,7 @@ def hidden_layer(control: Control) -> tuple[tuple[tuple[float, float], ...], tup
     return centres, control.widths if len(control.widths) > 1 else control.widths * NEURONS
 
 
-def fill_change(record: Any, law: Any, config: Config) -> None:
+def fill_change(record: ChangeConstants, law: LawConstants, config: Config) -> None:
     """The room for changes while the joint moves; moves are as quick as an automatic approach."""
     factor = config.live.gain_factor
     gains_of(law, record.low)
@@ -259,7 +271,7 @@ def fill_change(record: Any, law: Any, config: Config) -> None:
     record.move_min_s = MOVE_MIN_S
 
 
-def _fill_stream(record: Any, config: Config) -> None:
+def _fill_stream(record: StreamConstants, config: Config) -> None:
     """Without a sign of life of the program that sends set-points: only a run that follows one asks for it."""
     stream, limits = config.stream, config.limits
     record.delay_ns, record.timeout_ns = round(stream.delay_s * 1e9), round(stream.timeout_s * 1e9)
@@ -273,7 +285,7 @@ def _fill_stream(record: Any, config: Config) -> None:
         setattr(record, key, automatic if isinstance(chosen, str) else chosen)
 
 
-def fill_trajectory(record: Any, config: Config, table: np.ndarray) -> None:
+def fill_trajectory(record: TrajectoryConstants, config: Config, table: np.ndarray) -> None:
     """`TrajectoryConstants` of [trajectory]; `table` as in `axis_constants`."""
     trajectory = config.trajectory
     record.kind = TrajectoryKind[trajectory.kind.upper()]
@@ -301,7 +313,7 @@ def _cycles(config: Config, time_s: float) -> int:
     return max(1, round(time_s * config.loop.rate_Hz))
 
 
-def _fill_limits(record: Any, config: Config) -> None:
+def _fill_limits(record: LimitConstants, config: Config) -> None:
     limits = config.limits
     _copy(
         record, limits, "position_min_rad", "position_max_rad", "velocity_max_radps", "torque_max_Nm",
@@ -329,7 +341,7 @@ def _fill_limits(record: Any, config: Config) -> None:
         record.heartbeat_age_max_cycles = _cycles(config, HEARTBEATS_MISSED * heartbeat_s)
 
 
-def _fill_swing(record: Any, config: Config) -> None:
+def _fill_swing(record: SwingConstants, config: Config) -> None:
     limits = config.limits
     record.torque_Nm = 2.0 * limits.swing_torque_share * limits.torque_max_Nm
     record.error_rad = limits.swing_error_share * limits.following_error_max_rad
@@ -339,7 +351,9 @@ def _fill_swing(record: Any, config: Config) -> None:
     record.noise_gain = 1.0 / _cycles(config, NOISE_S)
 
 
-def _fill_sequence(record: Any, config: Config, table: np.ndarray, start_position_rad: float | None) -> None:
+def _fill_sequence(
+    record: SequenceConstants, config: Config, table: np.ndarray, start_position_rad: float | None
+) -> None:
     sequence = config.sequence
     record.approach_s = approach_s(config, table, start_position_rad)
     if start_position_rad is not None:
