@@ -374,29 +374,7 @@ def command_axis(
     write_command(state, command)
 
 
-@kernel
-def step_axis(
-    constants: AxisConstants,
-    state: AxisState,
-    table: np.ndarray,
-    sample: Sample,
-    command: Command,
-    elapsed_cycles: int,
-    stop_request: int,
-    supervisor_age_cycles: int,
-) -> None:
-    """One cycle of an axis that is alone; `cycle.step_cycle` does the same for all axes, part by part.
-
-    `table` float64[N, 5], the rows of a table trajectory; `elapsed_cycles` >= 1 periods since the last call (more
-    than 1 after an overrun); `stop_request` a `StopRequest`; `supervisor_age_cycles` periods since the supervisor's
-    last sign of life.
-    """
-    sense_axis(constants, state, sample, elapsed_cycles, stop_request, supervisor_age_cycles)
-    move_axis(constants, state, table, sample, elapsed_cycles, True, True)
-    command_axis(constants, state, table, sample, command, elapsed_cycles)
-
-
-# What a drive gets that closes its velocity loop, or its position loop as well: the limits of its target included.
+# --- What a drive gets that closes its velocity loop, or its position loop as well: limits included ---
 
 # --- The velocity command: the reference's velocity plus a small position correction ---
 # For a drive that closes the velocity loop itself:

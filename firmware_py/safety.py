@@ -401,7 +401,7 @@ def limited_velocity_radps(
 
 @kernel
 def check_finite(state: AxisState, finite: bool, unlimited: float) -> None:
-    """A command that is no number: it was not sent (`limited_*`, also of `own_loop`)."""
+    """A command that is no number: it was not sent (`limited_*`, here and in `axis`)."""
     if not finite:
         trip(state, Fault.NOT_FINITE, unlimited, 0)
 

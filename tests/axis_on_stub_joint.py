@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.friction import paper_friction
+from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.records import NEURONS, AxisConstants, AxisState, Command, Sample
 from jointctl.firmware_py.schema import new
@@ -27,6 +28,28 @@ from jointctl.firmware_py.velocity import low_pass_gain
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1
+
+
+@kernel
+def step_axis(
+    constants: AxisConstants,
+    state: AxisState,
+    table: np.ndarray,
+    sample: Sample,
+    command: Command,
+    elapsed_cycles: int,
+    stop_request: int,
+    supervisor_age_cycles: int,
+) -> None:
+    """One cycle of an axis that is alone, its parts in the order in which `step_cycle` does them for all axes.
+
+    `table` float64[N, 5], the rows of a table trajectory; `elapsed_cycles` >= 1 periods since the last call (more
+    than 1 after an overrun); `stop_request` a `StopRequest`; `supervisor_age_cycles` periods since the supervisor's
+    last sign of life.
+    """
+    sense_axis(constants, state, sample, elapsed_cycles, stop_request, supervisor_age_cycles)
+    move_axis(constants, state, table, sample, elapsed_cycles, True, True)
+    command_axis(constants, state, table, sample, command, elapsed_cycles)
 
 
 def small_axis_constants() -> Any:

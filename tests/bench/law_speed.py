@@ -1,7 +1,7 @@
 """The control law: our kernel, the same law in C, and the same law in numpy, tick by tick on the same inputs.
 
 A tick is here: velocity filter, law, finite check, torque limit and rate limit, on one thread and from warm memory.
-`step_axis`, the whole tick with phases and supervision, is timed in the lockstep simulation.
+`step_cycle`, the whole tick with phases and supervision, is timed in the lockstep simulation.
 """
 
 from __future__ import annotations

@@ -296,10 +296,9 @@ def test_set_points_and_changes_count_once_they_have_come_for_every_axis(first: 
 # --- the front ends --------------------------------------------------------------------------------------------
 
 
-CALLERS = {  # `axis.step_axis` puts the parts together for the tests of one axis
-    "sense_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
-    "move_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
-    "command_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"}, "write_log": {"firmware_py/cycle.py"},
+CALLERS = {
+    "sense_axis": {"firmware_py/cycle.py"}, "move_axis": {"firmware_py/cycle.py"},
+    "command_axis": {"firmware_py/cycle.py"}, "write_log": {"firmware_py/cycle.py"},
     "check_suspension": {"firmware_py/cycle.py"}, "step_cycle": {"firmware_py/cycle.py", "hil/lockstep.py"},
     "run_cycles": {"firmware_py/cycle.py", "tools/session/portable_loop.py"},
 }  # fmt: skip

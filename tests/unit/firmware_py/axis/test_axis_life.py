@@ -10,12 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointctl.firmware_py.axis import step_axis
 from jointctl.firmware_py.records import AxisState, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward, Reaction, StopRequest
-from tests.axis_on_stub_joint import POWERED, NewRig, finish
+from tests.axis_on_stub_joint import POWERED, NewRig, finish, step_axis
 
 
 # --- the regular life of a run ---
