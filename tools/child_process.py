@@ -160,13 +160,3 @@ def own_virtual_joint(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-@contextmanager
-def separate_virtual_joint(
-    config_path: Path, channel: str, *, timing: bool = False
-) -> Iterator[subprocess.Popen[bytes]]:
-    """`own_virtual_joint` whose drive answers when the block begins."""
-    with own_virtual_joint(config_path, channel, timing=timing) as joint:
-        joint.until_ready()
-        yield joint.process

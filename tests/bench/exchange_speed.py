@@ -35,7 +35,6 @@ from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
 from jointctl.drivers.drive import DriveGroup
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
-from jointctl.tools.child_process import separate_virtual_joint
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
@@ -46,7 +45,7 @@ from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
-from tests.bench.paired import Row, compared, interleaved, measured, skipped
+from tests.bench.paired import Row, compared, interleaved, measured, separate_virtual_joint, skipped
 from tests.configurations import changed
 
 # --- load: a busy thread of this very process, or a busy process ---

@@ -10,8 +10,10 @@ import json
 import math
 import os
 import platform
+import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +23,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from jointctl.tools.child_process import own_virtual_joint
 from jointctl.tools.drawing import GREEN, GREY, INK, RED, canvas, save_png
 from jointctl.tools.written_file import writing
 
@@ -216,3 +219,13 @@ def _draw_ratios(axes: Any, shown: Sequence[Row]) -> None:
         "ours / theirs, left of 1 is faster\nbar: quartiles of the pairs; |: goal (green: met, red: missed)"
     )
     axes.grid(visible=False, axis="y")
+
+
+@contextmanager
+def separate_virtual_joint(
+    config_path: Path, channel: str, *, timing: bool = False
+) -> Iterator[subprocess.Popen[bytes]]:
+    """`own_virtual_joint` whose drive answers when the block begins."""
+    with own_virtual_joint(config_path, channel, timing=timing) as joint:
+        joint.until_ready()
+        yield joint.process

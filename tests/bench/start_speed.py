@@ -19,9 +19,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
-from jointctl.tools.child_process import separate_virtual_joint
 from jointctl.tools.configuration.config import Config
-from tests.bench.paired import Row, compared, interleaved, measured
+from tests.bench.paired import Row, compared, interleaved, measured, separate_virtual_joint
 
 GROUP = "start"
 HELP_GOAL_S = 0.3

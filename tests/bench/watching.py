@@ -27,8 +27,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from jointctl.firmware_py.states import AxisPhase  # noqa: E402
-from jointctl.tools.child_process import separate_virtual_joint  # noqa: E402
 from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
+from tests.bench.paired import separate_virtual_joint  # noqa: E402
 from tests.browser import PROGRAM, Browser, free_port  # noqa: E402
 from tests.configurations import written  # noqa: E402
 

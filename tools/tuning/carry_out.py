@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import MotionFault, UsageError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
@@ -107,11 +107,6 @@ class Carrier:
         if result.lost_records:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
         return Carried(read_run_log(result.log_path).records, result.fault, result.fault_text, str(result.log_path))
-
-
-def one_line_of(error: JointctlError) -> str:
-    """The message with its advice, for a report."""
-    return f"{error.message}; {error.hint}" if error.hint else error.message
 
 
 class ShownConsent(TerminalConsent):
