@@ -1,4 +1,4 @@
-"""Which terms a motion tells of, their parameters, and what it leaves open (see `motion_model` for the equations).
+"""Which terms a motion tells of, their parameters, and what it leaves open (see `models` for the equations).
 
 All parameters are found together by least squares with Huber's loss (scipy).  Which terms are in is chosen step by
 step: the term whose presence lowers the error on held-out blocks most comes in, while it does so by more than 1 %.

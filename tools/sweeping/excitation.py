@@ -5,7 +5,7 @@ allow, at several places of the travel, and of a sum of sines, which accelerates
 phases of many candidates are drawn; the one is taken whose information matrix, in shares of what is believed of each
 parameter, has the least condition number.
 
-The matrix is sum g g^T of the slopes g of the torque (see `motion_model`) over the samples that `identify` would use.
+The matrix is sum g g^T of the slopes g of the torque (see `models`) over the samples that `identify` would use.
 With an error of ERROR of the Coulomb friction that is another one every CORRELATED_s, its inverse says how well each
 parameter will be known.  Temperature is none of them: one motion is as good as at one temperature.
 """
@@ -204,7 +204,7 @@ def _sines(s: PlanSettings, duration_s: float, random: np.random.Generator) -> n
 
 
 def samples_of_table(table: np.ndarray, middle_rad: float) -> Samples:
-    """The motion as `motion_model` takes it, on a uniform grid of time."""
+    """The motion as `models` takes it, on a uniform grid of time."""
     time_s = np.arange(0.0, table[-1, 0], _SAMPLE_s)
     row = np.clip(np.searchsorted(table[:, 0], time_s, side="right") - 1, 0, len(table) - 2)
     d = time_s - table[row, 0]
