@@ -180,11 +180,7 @@ class Rig:
 
     def until(self, phase: AxisPhase, at_most: int = 2000) -> Rig:
         """Tick until the phase is reached."""
-        for _ in range(at_most):
-            if self.phase >= phase:
-                break
-            self.tick()
-        assert self.phase == phase
+        tick_until(self, self.tick, phase, at_most)
         return self
 
     def reach(self, phase: AxisPhase) -> Rig:
@@ -193,6 +189,15 @@ class Rig:
             self.until(AxisPhase.TRACKING).run(5)
             self.stop = StopRequest.QUICK_STOP if phase is AxisPhase.QUICK_STOPPING else StopRequest.RAMP
         return self.until(phase)
+
+
+def tick_until(rig: Rig, tick: Callable[[], None], phase: AxisPhase, at_most: int) -> None:
+    """Until the rig is in the phase, which it must reach."""
+    for _ in range(at_most):
+        if rig.phase >= phase:
+            break
+        tick()
+    assert rig.phase == phase, rig.state.fault
 
 
 NewRig = Callable[..., Any]

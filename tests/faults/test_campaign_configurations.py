@@ -33,7 +33,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.configurations import shipped
 from tests.faults.campaign_variants import VARIANTS, write_variant
-from tests.faults.test_fault_campaign import WIDE, good_run
+from tests.faults.test_fault_campaign import REVERSED, WIDE, good_run
 from tests.places import CONFIGS
 
 pytestmark = pytest.mark.slow("some sixty faults on each of seven joints")
@@ -138,13 +138,7 @@ def test_the_invariants_of_a_velocity_command_notice(rows: Any, value: float, wo
 # --- the envelope and what it takes for granted ---
 def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it(virtual_config: Config) -> None:
     joint = LockstepJoint(virtual_config)
-    plain = dataclasses.replace(
-        draw_scenario(1, 0),
-        kind=FaultKind.TORQUE_REVERSED,
-        plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
-               "friction_negative_scale": 1.0},
-    )  # fmt: skip
-    allowed = envelope(shipped(virtual__gravity_Nm=6.0), plain, joint.constants()[0])
+    allowed = envelope(shipped(virtual__gravity_Nm=6.0), REVERSED, joint.constants()[0])
     speed = 1.0 + (60.5 + 6.0) / 2.0 * 0.01
     brake = (121.0 * 0.1063 * 0.95 - 6.0) / 2.0
     assert allowed.velocity_max_radps == pytest.approx(speed)

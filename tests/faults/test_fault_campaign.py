@@ -179,15 +179,17 @@ def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Co
     assert judge_module.wrong_cause(quiet, late, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
 
 
+REVERSED = dataclasses.replace(  # on a plant of 2 kg m2 without ripple, whose friction is the configured one
+    draw_scenario(1, 0),
+    kind=FaultKind.TORQUE_REVERSED,
+    plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
+           "friction_negative_scale": 1.0},
+)  # fmt: skip
+
+
 def test_the_envelope_follows_its_derivation(config: Config, lockstep: LockstepJoint) -> None:
     """Recomputed by hand for a plant of 2 kg m2 without ripple: 60.5 Nm for 10 ms, then friction alone."""
-    plain = dataclasses.replace(
-        draw_scenario(1, 0),
-        kind=FaultKind.TORQUE_REVERSED,
-        plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
-               "friction_negative_scale": 1.0},
-    )  # fmt: skip
-    allowed = envelope(config, plain, lockstep.constants()[0])
+    allowed = envelope(config, REVERSED, lockstep.constants()[0])
     speed = 1.0 + 60.5 / 2.0 * 0.01
     brake = 121.0 * 0.1063 * 0.95 / 2.0
     assert allowed.velocity_max_radps == pytest.approx(speed)

@@ -30,6 +30,7 @@ from jointctl.firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
+from tests.axis_on_stub_joint import tick_until
 
 PERIOD_s = 1e-3
 ACCELERATION_radps2 = 20.0
@@ -155,11 +156,7 @@ class OwnLoopRig:
             self.enabled.append(joint.drive_state == DriveState.ENABLED)
 
     def until(self, phase: AxisPhase, at_most: int = 3000) -> None:
-        for _ in range(at_most):
-            if self.rig.phase >= phase:
-                break
-            self.tick()
-        assert self.rig.phase == phase, self.rig.state.fault
+        tick_until(self.rig, self.tick, phase, at_most)
 
 
 @pytest.fixture(params=[CommandKind.POSITION, CommandKind.VELOCITY], ids=["csp", "csv"])

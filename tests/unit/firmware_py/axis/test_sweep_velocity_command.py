@@ -25,6 +25,7 @@ from jointctl.firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
+from tests.axis_on_stub_joint import tick_until
 
 PERIOD_s = 1e-3
 
@@ -83,11 +84,7 @@ class VelocityRig:
             self.commands.append(float(self.rig.command.velocity_radps))
 
     def until(self, phase: AxisPhase, at_most: int = 3000) -> None:
-        for _ in range(at_most):
-            if self.rig.phase >= phase:
-                break
-            self.tick()
-        assert self.rig.phase == phase, self.rig.state.fault
+        tick_until(self.rig, self.tick, phase, at_most)
 
 
 @pytest.fixture
