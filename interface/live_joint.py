@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.bus_lock import starting
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -123,6 +124,8 @@ class LiveMotor:
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
+            if not self._source.own_virtual:  # no one else knows that bus
+                self._stack.enter_context(starting())
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
             if self.axes.arm is not None:
