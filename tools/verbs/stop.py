@@ -21,7 +21,6 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
     from jointctl.drivers.drive import common_state
-    from jointctl.tools.session.result import require_off
     from jointctl.tools.session.stop_call import StopCall
     from jointctl.tools.verbs.bench_drive import stop_targets
 
@@ -44,6 +43,8 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
             call.end(output.note, switch_off)
     if failures:
         raise failures[0]
+    from jointctl.tools.session.result import require_off  # takes its time to load
+
     state = common_state([f"drive {number}" for number in range(1, len(states) + 1)], states)
     which = "the drive is" if len(states) == 1 else f"all {len(states)} drives:"
     try:

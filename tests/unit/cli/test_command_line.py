@@ -90,6 +90,26 @@ def test_what_is_waited_for_imports_nothing_heavy(modules: str, slow: str) -> No
     assert shown.stdout == "[]\n"
 
 
+STOP = """
+import importlib, sys
+from pathlib import Path
+from jointctl.tools.verbs import main
+stop = importlib.import_module("jointctl.tools.verbs.stop")
+def switch_off(targets, output):
+    import jointctl.drivers.canopen.switch_off, jointctl.drivers.can.open
+    print(sorted({"numba", "scipy", "mcap", "matplotlib", "tomlkit"} & set(sys.modules)))
+    return ["off"]
+stop._switch_off = switch_off
+sys.exit(stop.stop(Path(sys.argv[1]), main.Output(quiet=True)))
+"""
+
+
+@pytest.mark.parametrize("config", ["virtual", "elmo_serial"])
+def test_nothing_that_takes_its_time_is_loaded_before_the_drive_is_stopped(config: str) -> None:
+    shown = subprocess.run([sys.executable, "-c", STOP, config], capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines()[0] == "[]"
+
+
 @pytest.mark.parametrize("shipped", ["virtual", "precise", "elmo_serial.toml"])
 def test_new_copies_a_shipped_configuration_that_loads(tmp_path: Path, shipped: str) -> None:
     assert new(tmp_path / "mine.toml", QUIET, shipped=shipped) == 0
