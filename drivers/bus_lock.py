@@ -30,7 +30,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -113,6 +113,7 @@ class BusLock:
         self._number = -1  # of the name that this lock has
         self._thread: threading.Thread | None = None
         if sys.platform != "linux" or interface == _IN_PROCESS:
+            no_longer_starting()
             return
         self._name = lock_name(interface, channel)
         try:
@@ -370,6 +371,18 @@ def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
                 if os.readlink(link).startswith(f"/memfd:{name} "):
                     return True
     return False
+
+
+@contextlib.contextmanager
+def starting() -> Iterator[None]:
+    """Marked as `STARTING`, until it has the lock of a bus or the block ends."""
+    if hasattr(os, "memfd_create"):
+        with contextlib.suppress(OSError):  # as in `no_longer_starting`
+            os.memfd_create(STARTING)
+    try:
+        yield
+    finally:
+        no_longer_starting()
 
 
 def no_longer_starting() -> None:

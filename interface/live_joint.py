@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.bus_lock import starting
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -105,7 +106,7 @@ class LiveMotor:
         self.drive = session_drive(self.axes.joints[0].drive.kind)
         self._motions: list[FreeMotion] = []
         self._display = _ProgramDisplay()
-        self._stack = ExitStack()
+        self._stack, self._bus = ExitStack(), ExitStack()  # of the whole block; of the session
         self._thread: threading.Thread | None = None
         self._session: Session | None = None
         self._control: Control | None = None
@@ -123,6 +124,8 @@ class LiveMotor:
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
+            if not self._source.own_virtual:  # no one else knows that bus
+                self._stack.enter_context(starting())
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
             if self.axes.arm is not None:
@@ -131,7 +134,8 @@ class LiveMotor:
                 load_torques(self.axes.arm)
             output, first = Output(quiet=True), self.axes.joints[0]
             others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
-            control = self._control = self._stack.enter_context(in_program(first, output))
+            self._stack.enter_context(self._bus)
+            control = self._control = self._bus.enter_context(in_program(first, output))
             self._approval = _Approval(control.signals.leave_if_asked)
             plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
@@ -162,6 +166,8 @@ class LiveMotor:
             self.result = self._session.run()
         except BaseException as error:  # for the program's own thread
             self._error = error
+        finally:
+            self._bus.close()  # the drive is off for good: `jointctl stop` has no program to wait for any more
 
     def _raise(self) -> None:
         """What has ended the session, if it has."""

@@ -3,13 +3,14 @@
 States are recognised by mask and value, never by equality of the whole statusword.  The controlword for a request is
 a function of the present state alone, so that a lost frame is simply sent again.  A fault is never reset here and a
 quick stop is never left towards Operation Enabled: enabling again is a new run.
+
+Plain Python: `jointctl stop` must not wait for numba.  `cyclic` compiles what the loop needs.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
 
-from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.states import DriveRequest, DriveState, in_words
 
 
@@ -62,8 +63,7 @@ SUPPORTED_MODE_BIT = {
 }
 
 
-@kernel
-def decode_state(status_word: int) -> State:
+def state_of_word(status_word: int) -> State:
     """State of a statusword (6041h); Fault Reaction Active is looked for before Fault."""
     low = status_word & 0x4F
     if low == 0x0F:
@@ -86,15 +86,11 @@ def decode_state(status_word: int) -> State:
     return State.UNDEFINED
 
 
-state_of_word = plain(decode_state)
-
-
 def state_text(status_word: int) -> str:
     """State of a statusword in words, as `operation enabled`."""
     return in_words(state_of_word(status_word))
 
 
-@kernel
 def drive_state(state: int) -> DriveState:
     """The loop's view of a CiA 402 state."""
     if state == State.OPERATION_ENABLED:
@@ -114,7 +110,6 @@ def drive_state(state: int) -> DriveState:
     return DriveState.UNKNOWN
 
 
-@kernel
 def control_word(state: int, request: int) -> ControlWord:
     """The command that leads from `state` towards what the loop wants."""
     if request == DriveRequest.ENABLE or request == DriveRequest.PREPARE:

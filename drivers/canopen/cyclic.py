@@ -22,7 +22,8 @@ from typing import Annotated
 import numpy as np
 
 from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
-from jointctl.drivers.canopen.cia402 import State, control_word, decode_state, drive_state
+from jointctl.drivers.canopen import cia402
+from jointctl.drivers.canopen.cia402 import State
 from jointctl.drivers.canopen.identifiers import NmtState
 from jointctl.drivers.drive import HALF_WRAP, WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
@@ -47,6 +48,8 @@ IGNORED_MAX_CYCLES = 20
 ERROR_SHOWN_CYCLES = 20
 _MOST_COUNTS = 2.0**62
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
+decode_state, drive_state = kernel(cia402.state_of_word), kernel(cia402.drive_state)
+control_word = kernel(cia402.control_word)
 
 
 class AlignTo(IntEnum):

@@ -156,6 +156,21 @@ def test_jointctl_stop_ends_it_for_good(bench: Any, when: str) -> None:
     assert bench.disabled()
 
 
+def test_a_program_that_goes_on_without_its_joint_is_not_ended(bench: Any) -> None:
+    body = """
+    try: joint.wait(60.0)
+    except jointctl.JointctlError: say("over")
+    time.sleep(30.0)
+    """
+    program = started(bench, body).saw("enabled")
+    stopped = bench.run("stop", "joint.toml")
+    assert (stopped.code, "ending process" in stopped.err) == (0, False), stopped
+    program.saw("over")
+    assert program.process.poll() is None
+    assert bench.run("clear-fault", "joint.toml").code == 0  # and others may have the bus
+    program.end()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -65,6 +65,16 @@ def test_stop_ends_a_program_that_waits_for_its_user(bench: Any) -> None:
     assert bench.disabled()
 
 
+def test_stop_ends_a_tune_that_waits_for_its_user(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    first = Terminal(bench, "tune", config).saw("[y/N]")
+    bench.run("run", config, "-y").refused(4, "another program controls")
+    assert bench.run("stop", config).code == 0
+    assert first.finished().code == 130, first.text
+    assert "by jointctl stop; nothing moves" in first.text
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 0.5, 1.0, 1.5, 2.2])
 def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
     """From the first moment of its process on: it ends with the code of an interruption, and the drive is off.
@@ -82,7 +92,13 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
     assert bench.disabled()
 
 
-@pytest.mark.parametrize("verb", [("sweep", "-y", "-o", "data.csv"), ("doctor", "--motion", "-y"), ("clear-fault",)])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("sweep", "-y", "-o", "data.csv"), ("doctor", "--motion", "-y"), ("clear-fault",), ("tune", "-y"),
+        ("response", "-y"), ("excite", "-y"), ("map", "-y"),
+    ],
+)  # fmt: skip
 def test_whatever_is_stopped_says_that_a_stop_has_ended_it(bench: Any, verb: tuple[str, ...]) -> None:
     """And it takes the frames of that stop for no other controller's."""
     config = bench.config()
@@ -91,7 +107,7 @@ def test_whatever_is_stopped_says_that_a_stop_has_ended_it(bench: Any, verb: tup
     assert bench.run("stop", config).code == 0
     ended = started.finished(20.0)
     assert ended.code == 130, ended.err
-    assert "interrupted by jointctl stop; " in ended.err
+    assert "by jointctl stop; " in ended.err
     assert "another controller" not in ended.err
     assert "Traceback" not in ended.err
     assert bench.disabled()

@@ -6,7 +6,6 @@ import math
 from dataclasses import fields
 from typing import Any
 
-from jointctl.firmware_py import friction as friction_model
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.sections import Friction, FrictionDirection, FrictionTemperature, Section
 
@@ -69,6 +68,8 @@ def velocity_of_a_count_radps(config: Config) -> float:
 
 def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
     """`FrictionConstants` (joint rad/s, motor Nm) from the table as the user gave it."""
+    from jointctl.firmware_py import friction as friction_model  # its kernels: `stop` does without them
+
     speed = RADPS_PER_UNIT[friction.velocity_unit] / (reduction_ratio if friction.velocity_side == "motor" else 1.0)
     scale = 1.0 / reduction_ratio if friction.torque_side == "joint" else 1.0
 

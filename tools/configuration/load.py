@@ -21,7 +21,6 @@ from jointctl.firmware_py.input_file import (
     read_input,
     require_input,
 )
-from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, ConfigurationProblems, problem_lines, raise_if
 from jointctl.tools.configuration.drive_section import GivenPlace, completed
 
@@ -102,6 +101,8 @@ def config_of(path: Path, text: str, data: dict[str, Any]) -> Config:
     data, converted = with_units(data)
     config = _validated(data, str(path))
     config._path, config._text, config._remarks = path, text, (*remarks, *converted)
+    from jointctl.tools.configuration.checks import problems_between_sections  # `stop` does without its kernels
+
     raise_if([f"{path}: {line}" for line in problems_between_sections(config)])
     table = (("trajectory.file", config.table_path),) if config.table_path is not None else ()
     for key, file in (*config.drive.files(config), *table):

@@ -46,17 +46,28 @@ def between(low: float, high: float, *, open_low: bool = False) -> Any:
     def check(value: float) -> float:
         if value < low or value > high or (open_low and value == low):
             raise PydanticCustomError("range", "must be in {interval}", {"interval": interval})
-        return value
+        return _not_vanishing(value)
 
     return AfterValidator(Rule(interval, check))
+
+
+LEAST = 1e-30  # of a number that is not zero: with what is smaller nothing can be computed
+
+
+def _not_vanishing(value: Any) -> Any:
+    if 0.0 < abs(value) < LEAST:
+        raise PydanticCustomError("range", "must not be nearer to 0 than {least}", {"least": LEAST})
+    return value
 
 
 def auto_or_number(low: float, high: float) -> Any:
     allowed = f'"auto" or in {interval_text(low, high)}'
 
     def check(value: object) -> Any:
-        if value == "auto" or (is_number(value) and low <= value <= high):
+        if value == "auto":
             return value
+        if is_number(value) and low <= value <= high:
+            return _not_vanishing(value)
         raise PydanticCustomError("range", "must be {allowed}", {"allowed": allowed})
 
     return BeforeValidator(Rule(allowed, check))
@@ -70,7 +81,7 @@ def numbers(name: str, *counts: int, low: float, high: float) -> Any:
         items: list[Any] | tuple[Any, ...] = value if isinstance(value, (list, tuple)) else [value]
         if not all(is_number(x) and low < x <= high for x in items) or len(items) not in counts:
             raise PydanticCustomError("numbers", "must be {allowed}", {"allowed": allowed})
-        return tuple(float(x) for x in items)
+        return tuple(float(_not_vanishing(x)) for x in items)
 
     return BeforeValidator(Rule(allowed, check))
 

@@ -53,6 +53,11 @@ class StopSignals:
         """` by jointctl stop` where that has ended it, for messages."""
         return f" by {STOP_COMMAND}" if self.commanded_ns else ""
 
+    @property
+    def stopped_by(self) -> str:
+        """What an interruption is called after which nothing is known but that."""
+        return STOP_COMMAND if self.commanded_ns else "interruption"
+
     def on_signal(self, number: int, _: FrameType | None) -> None:
         if self._again:
             self._again = False

@@ -12,7 +12,7 @@ import os
 import select
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from jointctl.drivers.bus_lock import STARTING, is_marked, lock_holders, lock_name, marked_processes, wait_for_answers
 
@@ -47,23 +47,37 @@ class StopCall:
         for holder in self._holders:
             holder.close()
 
-    def end(self, note: Callable[[str], None]) -> bool:
-        """Whether there was a controller; its processes have ended when this returns, or `note` got why not.
+    def end(self, note: Callable[[str], None], ended: Callable[[], None] = lambda: None) -> None:
+        """The processes of a controller have ended when this returns, or `note` got why not.
 
         A program that was started before this call, and does not control the bus yet, is waited for and then ended.
+        `ended` is called each time a controller has: it may have enabled the drive before.
         """
         starting = marked_processes(STARTING)
-        found = self._end_controllers(note)
-        self._wait_for_starting(starting, note)
+        self._end_controllers(note, ended)
+        for _ in self._each_that_starts(starting, note):
+            self._ask_again()
+            self._end_controllers(note, ended)
+        self._ask_again()
+        self._end_controllers(note, ended)
+
+    def _ask_again(self) -> None:
         self.__exit__()
         self._ask()
-        return self._end_controllers(note) or found
 
     @staticmethod
-    def _wait_for_starting(pids: list[int], note: Callable[[str], None]) -> None:
-        """Until each of them has its lock or has ended; which bus it is for shows only then."""
+    def _each_that_starts(pids: list[int], note: Callable[[str], None]) -> Iterator[None]:
+        """At once when one of them has its lock or has ended; which bus it is for shows only then.
+
+        They may be another joint's, and take long: this joint's controller must not move while they are waited for.
+        """
         began_s, noted = time.monotonic(), False
-        while pids := [pid for pid in pids if is_marked(pid, STARTING)]:
+        while pids:
+            left = [pid for pid in pids if is_marked(pid, STARTING)]
+            if len(left) < len(pids):
+                pids = left
+                yield
+                continue
             which = f"process {', '.join(map(str, pids))}, which is starting and may be about to control the bus"
             waited_s = time.monotonic() - began_s
             if waited_s >= STARTING_S:
@@ -74,12 +88,11 @@ class StopCall:
                 noted = True
             time.sleep(POLL_S)
 
-    def _end_controllers(self, note: Callable[[str], None]) -> bool:
+    def _end_controllers(self, note: Callable[[str], None], ended: Callable[[], None]) -> None:
         wait_for_answers(self._holders)
         marked = marked_processes(self._name)
         if marked and not any(holder.is_controller for holder in self._holders):  # it may have come after the request
-            self.__exit__()
-            self._ask()
+            self._ask_again()
             wait_for_answers(self._holders)
         controllers = [holder for holder in self._holders if holder.is_controller]
         for holder in controllers:
@@ -97,7 +110,8 @@ class StopCall:
                     break
                 time.sleep(POLL_S)
         self._end_by_force(note)
-        return bool(controllers or marked)
+        if controllers or marked:
+            ended()
 
     def _end_by_force(self, note: Callable[[str], None]) -> None:
         """SIGTERM, then SIGKILL, to every process that still acts for the controller."""

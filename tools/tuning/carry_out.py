@@ -96,7 +96,7 @@ class Carrier:
         try:
             result = session.run()
         except KeyboardInterrupt:
-            raise NotCarriedOut(session.drive_state, "interruption" + self.control.signals.by_command) from None
+            raise NotCarriedOut(session.drive_state, self.control.signals.stopped_by) from None
         finally:
             self.drive_state = session.drive_state
         if result is None:

@@ -23,7 +23,6 @@ from rich.table import Column, Table
 
 from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
 from jointctl.drivers.elmo.dialogue import Dialogue, SerialPort, switch_off
-from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import LARGEST_SHARE, SERIAL, highest_rate_Hz
 from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
 from jointctl.tools.configuration.config import Config
@@ -33,6 +32,7 @@ from jointctl.tools.session.elmo_guard import GuardCall
 from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
+    from jointctl.drivers.elmo.drive import ElmoDrive
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.verbs.monitor import MonitorOptions

@@ -52,7 +52,7 @@ def response(
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.result import never_begun
+    from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
     from jointctl.tools.tuning.frequency_response import bode_figure
     from jointctl.tools.tuning.joint_fit import fit_joint
@@ -75,6 +75,7 @@ def response(
         except NotCarriedOut as ended:
             if ended.stopped_by:
                 output.note(f"stopped by {ended.stopped_by}; no response")
+                require_off(ended.drive_state)
                 return INTERRUPTED
             return never_begun(ended.drive_state, output, dry_run=dry_run)
     result, fit = found.to_dict(), None

@@ -10,8 +10,15 @@ import signal
 import sys
 
 STARTING = "jointctl-starting"  # as in `drivers.bus_lock`, whose imports take their time
-_CONTROLLING = {"run", "sweep", "clear-fault", "scope", "demo"}  # verbs
+# verbs that control a bus; the tests compare them with what each verb does
+_CONTROLLING = {"run", "sweep", "excite", "map", "response", "tune", "clear-fault", "scope", "demo"}
 _CONTROLLING_WITH = {("doctor", "--motion"), ("params", "restore")}
+
+
+def will_control(words: set[str]) -> bool:
+    """Whether a command of these words is about to control a bus."""
+    controlling = bool(words & _CONTROLLING) or any(words.issuperset(both) for both in _CONTROLLING_WITH)
+    return controlling and "--lockstep" not in words
 
 
 def _mark_as_starting() -> None:
@@ -19,9 +26,7 @@ def _mark_as_starting() -> None:
 
     A memory file with that name, which the kernel lists; it is closed when the lock is held, or with the process.
     """
-    words = set(sys.argv[1:])
-    controlling = bool(words & _CONTROLLING) or any(words.issuperset(both) for both in _CONTROLLING_WITH)
-    if controlling and "--lockstep" not in words and hasattr(os, "memfd_create"):
+    if will_control(set(sys.argv[1:])) and hasattr(os, "memfd_create"):
         with contextlib.suppress(OSError):  # a system without it has no lock either
             os.memfd_create(STARTING)
 

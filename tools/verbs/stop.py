@@ -21,24 +21,30 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
     from jointctl.drivers.drive import common_state
-    from jointctl.tools.session.result import require_off
     from jointctl.tools.session.stop_call import StopCall
     from jointctl.tools.verbs.bench_drive import stop_targets
 
     path = config_path(config)
     targets, unread = stop_targets(path, place(bus))
+    states: list[str] = []
+    failures: list[JointctlError] = []
+
+    def switch_off() -> None:
+        failures.clear()
+        try:
+            states[:] = _switch_off(targets, output)
+        except JointctlError as error:
+            failures.append(error)
+
     with ExitStack() as stack:
         calls = [stack.enter_context(StopCall(*on)) for on in dict.fromkeys(target.place for target in targets)]
-        failure: JointctlError | None = None
-        try:
-            states = _switch_off(targets, output)
-        except JointctlError as error:
-            failure = error
-        ended = [call.end(output.note) for call in calls]  # each of them, whatever the others say
-        if any(ended):
-            states = _switch_off(targets, output)
-        elif failure is not None:
-            raise failure
+        switch_off()
+        for call in calls:
+            call.end(output.note, switch_off)
+    if failures:
+        raise failures[0]
+    from jointctl.tools.session.result import require_off  # takes its time to load
+
     state = common_state([f"drive {number}" for number in range(1, len(states) + 1)], states)
     which = "the drive is" if len(states) == 1 else f"all {len(states)} drives:"
     try:

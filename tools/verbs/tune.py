@@ -34,7 +34,7 @@ def tune(
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.result import never_begun
+    from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, ShownConsent
     from jointctl.tools.verbs.tune_steps import Tune
 
@@ -52,18 +52,19 @@ def tune(
     with contextlib.ExitStack() as stack:
         carrier = Carrier(output, consent, None)
         job = Tune(config, options, carrier, folder or config.path.with_suffix(".tune"))
-        consent.show(job.envelope())
-        if not (dry_run or consent.agreed(())):
-            return never_begun("", output)
         if not options.lockstep:
             carrier.control = stack.enter_context(in_control(job.config, output))
         try:
+            consent.show(job.envelope())
+            if not (dry_run or consent.agreed(())):
+                return never_begun("", output)
             return job.run()
         except NotCarriedOut as ended:
-            if ended.stopped_by:
-                output.note(f"stopped by {ended.stopped_by}; {config.path} is as it was; --resume goes on")
-                return INTERRUPTED
-            return never_begun(ended.drive_state, output, dry_run=dry_run)
+            if not ended.stopped_by:
+                return never_begun(ended.drive_state, output, dry_run=dry_run)
+            output.note(f"stopped by {ended.stopped_by}; {config.path} is as it was; --resume goes on")
         except KeyboardInterrupt:
-            output.note(f"interrupted; nothing moves any more; {config.path} is as it was; --resume goes on")
-            return INTERRUPTED
+            by = carrier.control.signals.by_command if carrier.control is not None else ""
+            output.note(f"interrupted{by}; nothing moves any more; {config.path} is as it was; --resume goes on")
+        require_off(carrier.drive_state)
+        return INTERRUPTED

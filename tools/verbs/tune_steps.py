@@ -285,9 +285,13 @@ class Tune:
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
         options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
         command = Sweep(without_friction(self.config), self.carrier.quietly(), path, options)
-        command.control = self.carrier.control
-        if command.run() != 0:
-            raise NotCarriedOut(command.drive_state, "interruption")
+        command.control = control = self.carrier.control
+        try:
+            ended = command.run()
+        finally:
+            self.carrier.drive_state = command.drive_state
+        if ended:
+            raise NotCarriedOut(command.drive_state, "" if control is None else control.signals.stopped_by)
         found = identify_friction(read_friction_data(path, None), Options(swarm=SWARM))
         static = static_friction_Nm(self.config)
         return {

@@ -26,6 +26,8 @@ from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from jointctl.tools.experiments.paper_experiments import synthetic_sweep
 from jointctl.tools.output import Output
+from jointctl.tools.verbs import run as run_verb
+from jointctl.tools.verbs import start
 from jointctl.tools.verbs.bench_drive import ServeOptions
 from jointctl.tools.verbs.elmo_bench import ElmoBench
 from jointctl.tools.verbs.main import EPILOG, app
@@ -86,6 +88,26 @@ def test_what_is_waited_for_imports_nothing_heavy(modules: str, slow: str) -> No
     code = f"import sys, {modules}; print(sorted({set(slow.split())} & set(sys.modules)))"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout == "[]\n"
+
+
+STOP = """
+import importlib, sys
+from pathlib import Path
+from jointctl.tools.verbs import main
+stop = importlib.import_module("jointctl.tools.verbs.stop")
+def switch_off(targets, output):
+    import jointctl.drivers.canopen.switch_off, jointctl.drivers.can.open
+    print(sorted({"numba", "scipy", "mcap", "matplotlib", "tomlkit"} & set(sys.modules)))
+    return ["off"]
+stop._switch_off = switch_off
+sys.exit(stop.stop(Path(sys.argv[1]), main.Output(quiet=True)))
+"""
+
+
+@pytest.mark.parametrize("config", ["virtual", "elmo_serial"])
+def test_nothing_that_takes_its_time_is_loaded_before_the_drive_is_stopped(config: str) -> None:
+    shown = subprocess.run([sys.executable, "-c", STOP, config], capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines()[0] == "[]"
 
 
 @pytest.mark.parametrize("shipped", ["virtual", "precise", "elmo_serial.toml"])
@@ -224,6 +246,31 @@ def test_every_problem_of_a_configuration_has_a_line(
         "error: joint.toml: drive.node (=128) must be in [1..127]",
         "error: joint.toml: control.kpp is not a known key: did you mean kp?",
     ]
+
+
+# --- A stop waits for what is about to control a bus ---
+CONTROLS = re.compile(r"import .*\b(in_control|control_of|carried_out|tracked)\b")
+
+
+def test_every_verb_that_controls_a_bus_is_known_before_its_imports() -> None:
+    """Else a stop that comes while it is starting ends nothing, and the joint moves all the same."""
+    sources = Path(run_verb.__file__).parent.glob("*.py")
+    controlling = {path.stem.replace("_", "-") for path in sources if CONTROLS.search(path.read_text())}
+    controlling -= {"params", "doctor"}  # with some of their words only
+    assert controlling == start._CONTROLLING
+    assert all(start.will_control({verb, "my_joint.toml"}) for verb in controlling)
+    assert not any(start.will_control({verb, "my_joint.toml", "--lockstep"}) for verb in controlling)
+
+
+@pytest.mark.parametrize(
+    ("words", "controls"),
+    [
+        ("doctor j.toml --motion -y", True), ("doctor j.toml", False), ("params restore d.dcf j.toml", True),
+        ("params dump j.toml", False), ("stop j.toml", False), ("check j.toml", False), ("hil j.toml", False),
+    ],
+)  # fmt: skip
+def test_a_command_controls_a_bus_or_not(words: str, controls: bool) -> None:
+    assert start.will_control(set(words.split())) is controls
 
 
 # --- What the shell completes, how a flag is shown, quantities with a unit ---

@@ -27,7 +27,7 @@ from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import constant_remarks, recorded_limits, refuse_constants
 from jointctl.tools.verbs.sweep import sweep
-from tests.configurations import VIRTUAL, edited_file, load, problems, replaced, shipped
+from tests.configurations import VIRTUAL, edited_file, load, problems, replaced, shipped, written
 from tests.sessions import constants_of
 
 # --- Configuration files: what is shipped loads, what is wrong is named in one line ---
@@ -53,6 +53,13 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
     assert eds_path(config) == tmp_path / "elmo_gold.eds"
 
 
+def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
+    """Below it a margin would be an error of the linear algebra, above it is one."""
+    path = written(tmp_path / "joint.toml", joint__inertia_kgm2=1e-30)
+    with pytest.raises(MarginError, match="unstable"):
+        require_margin(load_config(path))
+
+
 @pytest.mark.parametrize(
     ("pattern", "line", "expected"),
     [
@@ -62,6 +69,7 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
         ("rate_Hz = .*", 'rate_Hz = "1000"', "loop.rate_Hz (=1000) must be a number"),
         ("rate_Hz = .*", "rate_Hz = true", "loop.rate_Hz (=True) must be a number"),
         ("inertia_kgm2 = .*", "inertia_kgm2 = 0.0", "joint.inertia_kgm2 (=0) must be in (0..10000]"),
+        ("inertia_kgm2 = .*", "inertia_kgm2 = 1e-31", "joint.inertia_kgm2 (=1e-31) must not be nearer to 0 than 1e-30"),
         ("node = .*", "node = 128", "drive.node (=128) must be in [1..127]"),
         ("node = .*", "node = 1.0", "drive.node (=1) must be a whole number"),
         ("node = .*", "", "drive.node is missing"),

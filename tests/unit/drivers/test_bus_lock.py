@@ -174,7 +174,7 @@ def test_a_mere_holder_of_the_name_is_a_remark(channel: str, name: str, held: in
                 with pytest.raises(BusError, match="another program controls"):
                     BusLock("socketcan", channel)
         with StopCall("socketcan", channel) as called:
-            assert called.end(lambda _: None) is False
+            called.end(lambda _: None, lambda: pytest.fail("no controller was there"))
 
 
 def test_a_controller_that_is_stopped_still_refuses_the_second(channel: str) -> None:
@@ -190,9 +190,11 @@ def test_a_controller_that_is_stopped_still_refuses_the_second(channel: str) -> 
 
 def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
     notes: list[str] = []
+    ended: list[bool] = []
     with controller(channel) as process:
         with StopCall("socketcan", channel) as call:
-            assert call.end(notes.append)
+            call.end(notes.append, lambda: ended.append(True))
+        assert ended
         assert process.stdout is not None
         assert process.stdout.read() == "stopped\n"
         assert process.wait(5.0) == 0
@@ -202,6 +204,7 @@ def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
 @pytest.mark.parametrize("number", [signal.SIGSTOP, None])
 def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | None) -> None:
     notes: list[str] = []
+    ended: list[bool] = []
     deaf = HOLD.replace("while not stopped:", "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True:")
     with controller(
         channel, deaf.replace("lock = BusLock(*sys.argv[1:],", "lock = BusLock(*sys.argv[1:], within_s=0.2,")
@@ -209,7 +212,8 @@ def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | N
         if number is not None:
             process.send_signal(number)
         with StopCall("socketcan", channel) as call:
-            assert call.end(notes.append)
+            call.end(notes.append, lambda: ended.append(True))
+        assert ended
         assert process.wait(5.0) == -signal.SIGKILL
     assert f"ending process {process.pid}" in notes[-1]
 
@@ -236,7 +240,7 @@ def test_a_program_that_starts_for_too_long_is_named(channel: str, monkeypatch: 
     slow = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(60.0)\n"
     notes: list[str] = []
     with controller(channel, slow) as process, StopCall("socketcan", channel) as call:
-        assert not call.end(notes.append)
+        call.end(notes.append, lambda: pytest.fail("no controller was there"))
         assert process.poll() is None  # it may be another joint's
     named = [note for note in notes if str(process.pid) in note]
     assert [note.split(" for ")[0] for note in named] == ["waiting", "not waiting any longer"]
@@ -245,9 +249,11 @@ def test_a_program_that_starts_for_too_long_is_named(channel: str, monkeypatch: 
 def test_a_program_that_starts_is_waited_for(channel: str) -> None:
     late = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(0.7)\n"
     notes: list[str] = []
+    ended: list[bool] = []
     with controller(channel, late + HOLD.replace('print("mine", flush=True)', "")) as process:
         with StopCall("socketcan", channel) as call:
-            assert call.end(notes.append)
+            call.end(notes.append, lambda: ended.append(True))
+        assert ended
         assert process.wait(5.0) == 0
 
 

@@ -219,6 +219,7 @@ class Computer:
         self.deaf_to = deaf_to
         self.signals: list[tuple[list[int], str, float]] = []
         self.notes: list[str] = []
+        self.ended_s: list[float] = []  # when the drive is switched off once more
         for program in (program for look in holders for program in look):
             program.computer = self
         monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
@@ -245,8 +246,10 @@ class Computer:
         return []
 
     def stopped(self) -> bool:
+        """Whether a controller has ended."""
         with StopCall("socketcan", "x") as call:
-            return call.end(self.notes.append)
+            call.end(self.notes.append, lambda: self.ended_s.append(self.now_s))
+        return bool(self.ended_s)
 
 
 def test_where_no_one_has_the_bus_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,6 +325,18 @@ def test_one_that_starts_is_waited_for_and_ended_as_well(
     assert computer.stopped()
     assert computer.now_s == waited_s
     assert later.log == ["stop", "closed"]
+
+
+@pytest.mark.parametrize("other_s", [1.0, 30.0])
+def test_one_that_starts_does_not_move_while_another_one_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, other_s: float
+) -> None:
+    """The other one may be another joint's, and compile for a minute."""
+    later = Program(leaves_s=1.5, within_s=8.0)
+    computer = Computer(monkeypatch, [], [later], starting={7: 1.0, 8: other_s})
+    assert computer.stopped()
+    assert computer.ended_s == [pytest.approx(1.5, abs=0.03)]
+    assert computer.now_s >= other_s
 
 
 @pytest.mark.parametrize("deaf_to", [(), (signal.SIGTERM,), (signal.SIGTERM, signal.SIGKILL)])

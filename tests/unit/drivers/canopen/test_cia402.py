@@ -9,12 +9,10 @@ from jointctl.drivers.canopen.cia402 import (
     ControlWord,
     Mode,
     State,
-    control_word,
-    decode_state,
-    drive_state,
     state_of_word,
     state_text,
 )
+from jointctl.drivers.canopen.cyclic import control_word, decode_state, drive_state
 from jointctl.firmware_py.states import DriveRequest, DriveState
 
 # mask, value: CiA 402-2, table "state coding"
