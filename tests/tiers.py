@@ -9,7 +9,7 @@ FOLDERS = {"hil": "realtime", "faults": "realtime", "docs": "realtime", "socketc
 LOCKSTEP = tuple(
     f"{folder}/test_{name}.py"
     for folder, names in {
-        "hil": "friction_chain law_options map paper_figures random_motions study sweep tune",
+        "hil": "friction_chain law_options map paper_figures random_motions study sweep tune tune_bad_joints",
         "faults": "arm_campaign campaign_configurations every_frame fault_campaign fault_engine fault_regressions"
         " late_samples limit_cycle own_loop_faults unwatched_loop",
         "docs": "configuration_reference notebook reference_pages troubleshooting",

@@ -269,6 +269,14 @@ class LockstepJoint:
             table=table, log_every=log_every, cycles=cycles, stop_cycle=stop_cycle, ideal_velocity=ideal_velocity,
         )  # fmt: skip
 
+    def run_as_configured(self, constants: Any, table: np.ndarray, log_every: int = 1) -> LockstepRun:
+        """A motion with the [[virtual.faults]] of the configuration, if any; they begin with each motion anew."""
+        constants[0].sequence.supervisor_max_cycles = 0
+        self.table = table
+        if len(self.faults):
+            return self.run_with_faults(self.faults, constants)
+        return self.run(constants, log_every=log_every)
+
     def run_with_faults(
         self,
         faults: Any,

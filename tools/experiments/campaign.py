@@ -24,7 +24,7 @@ from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 from jointctl.tools.experiments.arm_campaign import ArmScenario, draw_arm_scenario, judge_arm, masses_of
-from jointctl.tools.experiments.fault_scenarios import During, Scenario, draw_scenario
+from jointctl.tools.experiments.fault_scenarios import During, PlaceStep, Scenario, draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
 from jointctl.tools.experiments.many_runs import HERE, Workers
 from jointctl.tools.lockstep import LockstepArm, LockstepJoint
@@ -44,6 +44,7 @@ class Scenarios:
     seed: int
     during: During
     numbers: tuple[int, ...]
+    place: PlaceStep | None = None  # during a tune
 
 
 def scenario_of(config: Config | ArmConfig, seed: int, number: int, during: During) -> Scenario | ArmScenario:
@@ -54,16 +55,17 @@ def scenario_of(config: Config | ArmConfig, seed: int, number: int, during: Duri
 
 
 def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
-    """The configuration in the mode of the drive that a run, or a sweep, uses, and its joint, commissioned."""
-    config = with_mode(config, "auto") if during == "sweep" else config
+    """The configuration in the mode of the drive that a run, a sweep or a tune uses, and its joint, commissioned."""
+    if during in ("sweep", "tune"):
+        config = with_mode(config, "auto" if during == "sweep" else "torque")
     return config, LockstepJoint(config)
 
 
-def judge_of(config: Config | ArmConfig, during: During) -> Callable[[Any], Verdict]:
+def judge_of(config: Config | ArmConfig, during: During, place: PlaceStep | None = None) -> Callable[[Any], Verdict]:
     """What judges its scenarios."""
     if isinstance(config, ArmConfig):
         return partial(judge_arm, LockstepArm(config), masses_of(config))
-    return partial(judge, *campaign_joint(config, during))
+    return partial(judge, *campaign_joint(config, during), place=place)
 
 
 def judge_all(some: Scenarios) -> list[Verdict]:
@@ -71,7 +73,7 @@ def judge_all(some: Scenarios) -> list[Verdict]:
     config, during = some.config, some.during
     key = (config.arm, config.joints) if isinstance(config, ArmConfig) else (config, during)
     if getattr(_kept, "key", None) != key:
-        _kept.judge = judge_of(config, during)
+        _kept.judge = judge_of(config, during, some.place)
         _kept.key = key
     return [_kept.judge(scenario_of(config, some.seed, number, during)) for number in some.numbers]
 
@@ -83,13 +85,14 @@ def run_campaign(
     advance: Callable[[float], None],
     workers: Workers = HERE,
     during: During = "run",
+    place: PlaceStep | None = None,
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
     parts = (range(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
-    tasks = (Scenarios(config, seed, during, tuple(numbers)) for numbers in parts)
+    tasks = (Scenarios(config, seed, during, tuple(numbers), place) for numbers in parts)
     try:
         with closing(workers.results(judge_all, tasks)) as results:
             for verdicts in results:

@@ -9,12 +9,15 @@ sample counted the wrong way is a leap at any speed worth a trajectory.  Causes 
 The motion is a trajectory of `jointctl run`, or a few plateaus of constant speed as of `jointctl sweep`, in the mode in
 which a sweep runs: the drive closes the velocity loop where it can (CSV, else PV), else the law that a sweep uses.
 Or a program sends the same trajectories as set-points, some 2 to 20 ms apart, and may fail as well.
+Or it is a step of a tune: the soft spring of the direction, a pair of legs of the response with a part of its largest
+multisine, plateaus as of the friction, or a trajectory as of the verification.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -38,7 +41,7 @@ from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
 
-During = Literal["run", "sweep", "program"]
+During = Literal["run", "sweep", "program", "tune"]
 
 # --- kinds of fault ---
 
@@ -228,7 +231,7 @@ def draw_strokes(random: np.random.Generator) -> SweepStrokes:
 
 @dataclass(frozen=True)
 class PlacedSweep:
-    """What a lockstep run needs of it."""
+    """What a lockstep run needs of it, or of a step of a tune."""
 
     constants: Any  # AxisConstants, a record array of one
     table: np.ndarray
@@ -253,6 +256,31 @@ def placed_sweep(config: Config, joint: LockstepJoint, strokes: SweepStrokes, st
         config = with_tracking_law(config)
     constants = sweep_constants(config, dataclasses.replace(joint.report, start_position_rad=start_rad), placed)
     return PlacedSweep(constants, placed.table, start_rad, placed.duration_s)
+
+
+# --- a step of a tune ---
+
+STEPS_THAT_MOVE = ("direction", "response", "friction", "verification")
+
+
+@dataclass(frozen=True)
+class TuneStep:
+    """One of `STEPS_THAT_MOVE` but the verification, whose motion is that of a run."""
+
+    name: str
+    share: float  # of the response's largest multisine
+    strokes: SweepStrokes  # of the friction
+
+
+PlaceStep = Callable[[Config, LockstepJoint, TuneStep, float], PlacedSweep]
+"""The motion of a step for a joint that stands so far from its first point; `tuning.campaign_steps` has it."""
+
+
+def draw_step(random: np.random.Generator) -> TuneStep | None:
+    """None: a trajectory, as a verification runs one."""
+    name = STEPS_THAT_MOVE[int(random.integers(len(STEPS_THAT_MOVE)))]
+    share, strokes = float(random.uniform(0.125, 1.0)), draw_strokes(random)
+    return None if name == "verification" else TuneStep(name, share, strokes)
 
 
 # --- the set-points of a program ---
@@ -324,7 +352,7 @@ class Scenario:
         trajectory, every = self.trajectory, {}
         if isinstance(trajectory, Program):
             trajectory, every = trajectory.trajectory, {"set_point_every_s": trajectory.every_s}
-        strokes = isinstance(trajectory, SweepStrokes)
+        strokes = isinstance(trajectory, SweepStrokes | TuneStep)
         return {
             **{k: v for k, v in asdict(self).items() if k != "trajectory"},
             "kind": self.kind.name.lower(),
@@ -406,9 +434,10 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
     if chosen.kind is FaultKind.DRIVE_FAULT:
         magnitude = float(random.choice(EMERGENCY_CODES))
     tracking_s = float(random.uniform(0.5, 2.5))
-    latest_s = BEFORE_s + (LONGEST_s if during == "sweep" else tracking_s)
+    step = draw_step(random) if during == "tune" else None
+    latest_s = BEFORE_s + (LONGEST_s if during == "sweep" or step is not None else tracking_s)
     at_s = float(random.uniform(0.0, latest_s))
-    trajectory = draw_strokes(random) if during == "sweep" else draw_trajectory(random, tracking_s)
+    trajectory: Any = step or (draw_strokes(random) if during == "sweep" else draw_trajectory(random, tracking_s))
     if during == "program":
         trajectory = Program(trajectory, float(random.uniform(0.002, 0.02)))
     return Scenario(

@@ -232,9 +232,7 @@ def lockstep_log(config: Config, motion: Motion, consent: Consent) -> Path | Non
     consent.show(placed.lines)
     if consent.dry_run:
         return None
-    joint.table, axis = placed.table, placed.constants[0]
-    axis.sequence.supervisor_max_cycles = 0
-    run = joint.run(placed.constants)
+    run = joint.run_as_configured(placed.constants, placed.table)
     if run.fault:
         raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no log")
     path = log_path(config)
@@ -263,10 +261,8 @@ def sweep_in_lockstep(
     if consent.dry_run:
         return None
     begin(joint.report)
-    joint.table, axis = placed.table, placed.constants[0]
-    axis.sequence.supervisor_max_cycles = 0
-    cycles = (swept.motion.duration_s + float(axis.sequence.approach_s)) * config.loop.rate_Hz
-    run = joint.run(placed.constants, log_every=max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))
+    cycles = (swept.motion.duration_s + float(placed.constants[0].sequence.approach_s)) * config.loop.rate_Hz
+    run = joint.run_as_configured(placed.constants, placed.table, max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))
     if run.thermometer:
         meter.warmth = run.log.trajectory_s[run.tracking], run.truth[run.tracking, TRUE_WARMTH_degC]
     meter.feed(run.log)

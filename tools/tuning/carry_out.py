@@ -13,6 +13,7 @@ from typing import Any
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import MotionFault, UsageError
 from jointctl.firmware_py.states import Fault
+from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.lockstep import LockstepJoint
@@ -80,8 +81,8 @@ class Carrier:
             self.consent.show(placed.lines)
             raise NotCarriedOut("")
         motion.require_start(joint.report.start_position_rad)
-        placed.constants[0].sequence.supervisor_max_cycles = 0
-        run = joint.run(placed.constants, table=placed.table)
+        run = joint.run_as_configured(placed.constants, placed.table)
+        self.drive_state = PowerState(int(run.device.state)).name.lower().replace("_", " ")
         text = fault_text(run.fault, float(run.state.fault_value), 0) if run.fault is not Fault.NONE else None
         return Carried(run.log, run.fault, text, "")
 

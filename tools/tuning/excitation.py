@@ -194,9 +194,10 @@ def config_of_response(config: Config, torque_Nm: float | None) -> Config:
     limits = config.limits
     if torque_Nm is not None and not 0.0 < torque_Nm <= limits.torque_max_Nm:
         raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
+    known = config.friction is not None and config.control.feed_forward != "none"
     law: dict[str, Any] = {
         "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
-        "feed_forward": "none" if config.friction is None else "desired", "learning": None, "adaptation": None,
+        "feed_forward": "desired" if known else "none", "learning": None, "adaptation": None,
         "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
     }  # fmt: skip
     config = with_mode(config, "torque")

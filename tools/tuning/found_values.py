@@ -104,6 +104,24 @@ def without_friction(config: Config) -> Config:
     return _same_plant(config, config.model_copy(update={"friction": None, "control": control}))
 
 
+def with_break_away(config: Config, torque_Nm: float) -> Config:
+    """As `without_friction`, but what watches the reading knows the torque at which the joint began to move.
+
+    Nothing of it is fed forward.  A joint that is pushed harder and does not move has an encoder that stands still.
+    """
+    from jointctl.tools.configuration.sections import Friction, FrictionDirection
+
+    side = FrictionDirection.model_validate(
+        {**dict.fromkeys(("tv", "a0", "a1", "a2", "a3"), 0.0), "tc_Nm": torque_Nm, "ts_Nm": torque_Nm, "ws": 1.0,
+         "knee": 1.0, "max": 1.0}
+    )  # fmt: skip
+    friction = Friction(
+        velocity_unit="rad/s", velocity_side="joint", torque_side="joint", positive=side,
+        negative=side.model_copy(update={"tc_Nm": -torque_Nm, "ts_Nm": -torque_Nm}),
+    )  # fmt: skip
+    return without_friction(config).model_copy(update={"friction": friction})
+
+
 def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]]) -> str:
     """`text` with these values; a comment under the heading of each section says where they come from.
 

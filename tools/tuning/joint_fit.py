@@ -35,8 +35,9 @@ SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
 USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
 LATEST_s = 0.012  # of delay and of lag, at most
-# by which a value is off besides, because sliding friction is not viscous: of tests/bench/tune_ensemble.py
-MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025}
+# by which a value is off besides, because sliding friction is not viscous, and hysteresis no spring: of
+# tests/bench/tune_ensemble.py
+MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.04, "resonance_Hz": 0.025}
 MODEL_LATE_s = 1e-4
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
@@ -214,6 +215,19 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
         flexible, _intervals(model, best), found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
         abs(better),
     )  # fmt: skip
+
+
+def fitted_again(found: FrequencyResponse, before: JointFit) -> Estimate:
+    """The inertia by another response of a joint whose model is known: one search, which begins there."""
+    model = _Model(_used(found), found.period_s, before.flexible)
+    joint = before.joint()
+    late = [math.log(max(before.values[name].value, 2e-5)) for name in ("delay_s", "lag_s")]
+    start = [math.log(before.inertia_kgm2.value), *late, before.friction_Nmspr.value]
+    if before.flexible:
+        damping = joint.damping_Nmspr * math.tau * joint.resonance_Hz / (2.0 * joint.stiffness_Nmprad)
+        start += [math.log(joint.link_kgm2 / joint.motor_kgm2), math.log(joint.resonance_Hz)]
+        start.append(math.log(min(max(damping, 2e-3), 0.9)))
+    return _intervals(model, model.fitted(start))["inertia_kgm2"]
 
 
 def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:

@@ -3,12 +3,18 @@
 A stage with more torque follows while the coherence is low and the torque is not yet the largest allowed one.  It ends
 where the joint answers a greater torque with more than its share, which is what a loop on its way to a limit cycle
 does; limit cycles themselves, and encoders that disagree, end a run as they end every other one.
+
+The joint must stay the same: the first half of the legs is compared with the second one, and later steps measure once
+more what it weighs.
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from jointctl.drivers.errors import DataError, MotionFault, UsageError
 from jointctl.tools.configuration.config import Config
@@ -26,7 +32,7 @@ from jointctl.tools.tuning.excitation import (
 )
 from jointctl.tools.tuning.found_values import Found, rounded, with_values
 from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, FrequencyResponse, grown, response_of
-from jointctl.tools.tuning.joint_fit import fit_joint
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
 from jointctl.tools.tuning.tune_options import ResponseOptions
 
 LEAST_LEGS, MOST_LEGS = 8, 100
@@ -34,6 +40,7 @@ STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
 GROWTH = 2.0  # of the torque from stage to stage
 ENOUGH_COHERENCE = 0.98  # median over the lines
 RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
+LEAST_CHANGE = 0.1  # of the inertia: a payload; what both intervals allow is none
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,35 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     if before is not None:
         _refuse_growth(before, found)
     return found, records, plan
+
+
+def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: Any, fit: JointFit) -> None:
+    """`MotionFault` where the halves of the legs are of two joints; where too few legs are left nothing is compared."""
+    parts = [replace(plan, legs=replace(plan.legs, starts=starts)) for starts in np.array_split(plan.legs.starts, 2)]
+    with contextlib.suppress(DataError):
+        first, second = (fitted_again(response_of(task.config, part, records), fit) for part in parts)
+        _refuse_another("the first half of the response", first, "in the second half", second)
+
+
+def require_same_joint(config: Config, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
+    """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
+    task = response_task(config, ResponseOptions())
+    peak_Nm = min(peak_Nm, task.largest_Nm)
+    try:
+        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    except DataError:  # a leg was lost
+        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    _refuse_another("the response", fit.inertia_kgm2, when, inertia)
+    carrier.output.note(f"  the same joint: {inertia.value:.4g} kg m^2 {when}")
+
+
+def _refuse_another(before: str, first: Estimate, after: str, second: Estimate) -> None:
+    change = abs(second.value - first.value)
+    if change > max(LEAST_CHANGE * first.value, first.half + second.half):
+        raise MotionFault(
+            f"the joint is another one: {first.value:.3g} kg m^2 in {before}, {second.value:.3g} {after}",
+            "nothing may be put on the joint or taken off during a tune",
+        )
 
 
 def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
-    from jointctl.tools.experiments.fault_scenarios import During
+    from jointctl.tools.experiments.fault_scenarios import During, PlaceStep
     from jointctl.tools.experiments.judge import Verdict
 
 EXIT_VIOLATIONS = 10
@@ -45,6 +45,7 @@ def fault_campaign(
     program: Annotated[
         bool, typer.Option("--program", help="while a program sends set-points, which may fail too")
     ] = False,
+    tune: Annotated[bool, typer.Option("--tune", help="during the steps of a tune, which move the joint")] = False,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: ManyRuns = None,
     report: Report = None,
@@ -70,9 +71,11 @@ def fault_campaign(
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_folder
 
-    if sweep and program:
-        raise UsageError("--sweep and --program exclude each other")
-    during: During = "sweep" if sweep else "program" if program else "run"
+    asked: tuple[tuple[During, bool], ...] = (("sweep", sweep), ("program", program), ("tune", tune))
+    given = [name for name, on in asked if on]
+    if len(given) > 1:
+        raise UsageError(f"--{given[0]} and --{given[1]} exclude each other")
+    during: During = given[0] if given else "run"
     if isinstance(config, ArmConfig):
         if during != "run":
             raise UsageError(f"--{during} is one joint's, and {config.path} is an arm", "give the joint's file")
@@ -86,7 +89,9 @@ def fault_campaign(
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(count)) as advance:
-        verdicts, elapsed_s, interrupted = run_campaign(config, seed, count, advance, workers or HERE, during)
+        verdicts, elapsed_s, interrupted = run_campaign(
+            config, seed, count, advance, workers or HERE, during, place_of(during)
+        )
     rows = rows_by_kind(verdicts)
     found = violations(config, verdicts, seed, during)
     joints = config.joints if isinstance(config, ArmConfig) else (config,)
@@ -112,6 +117,15 @@ def fault_campaign(
         )
         return EXIT_VIOLATIONS
     return INTERRUPTED if interrupted else 0
+
+
+def place_of(during: During) -> PlaceStep | None:
+    """The motions of a tune, which is of another package than the campaign."""
+    if during != "tune":
+        return None
+    from jointctl.tools.tuning.campaign_steps import placed_step
+
+    return placed_step
 
 
 def _write_page(
@@ -151,7 +165,7 @@ def _replay(config: Config | ArmConfig, output: Output, seed: int, number: int, 
     from jointctl.tools.experiments.campaign import judge_of, scenario_of
 
     chosen = scenario_of(config, seed, number, during)
-    verdict = judge_of(config, during)(chosen)
+    verdict = judge_of(config, during, place_of(during))(chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
     lines += [

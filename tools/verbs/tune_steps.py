@@ -26,10 +26,10 @@ from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map, map_figure
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.control_section import Control
-from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
+from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
-from jointctl.tools.configuration.sections import ReducerMap
+from jointctl.tools.configuration.sections import Limits, ReducerMap
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
@@ -46,6 +46,7 @@ from jointctl.tools.tuning.found_values import (
     Found,
     rounded,
     values_of_fit,
+    with_break_away,
     with_friction,
     with_tuned,
     with_values,
@@ -54,7 +55,12 @@ from jointctl.tools.tuning.found_values import (
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
 from jointctl.tools.tuning.gains import ChosenGains, choose_gains, trade_off_figure
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
-from jointctl.tools.tuning.measured_response import measured_response, response_task
+from jointctl.tools.tuning.measured_response import (
+    measured_response,
+    require_one_joint,
+    require_same_joint,
+    response_task,
+)
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
 from jointctl.tools.verbs.response import fit_table
@@ -64,10 +70,13 @@ from jointctl.tools.written_file import replace_file
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
 STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
+MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
+                 Fault.POSITION_LIMIT)  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
 SWARM = SwarmSettings(particles=300, iterations=1500)
+STANDS, STANDSTILL_SHARE = 1.2, 0.1  # times what a count reads, and at most that of limits.velocity_max_radps
 VERIFY_s, VERIFY_FROM_s = 30.0, 5.0
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
@@ -198,7 +207,9 @@ class Tune:
                 break
             torque_Nm = STRONGER * plan.torque_Nm
         if bad:
-            raise MotionFault(bad[0].text, bad[0].remedy)
+            # a reading that stands still because its frames stay away is no joint that does
+            why = bad[-1] if carried.fault not in (Fault.NONE, *MOVES_WRONGLY) and bad[-1].topic == "check" else bad[0]
+            raise MotionFault(why.text, why.remedy)
         for finding in findings:
             self.carrier.output.note(f"  {finding.topic}: {finding.text}")
         needed_Nm = max((finding.numbers.get("break_away_Nm", 0.0) for finding in findings), default=0.0)
@@ -214,14 +225,19 @@ class Tune:
     # --- 2. frequency response and the model that fits it ---
 
     def _step_response(self) -> dict[str, Any]:
-        # a friction that may be wrong by any factor is no help, neither to the weak law nor to what watches the reading
-        config = without_friction(self.config)
+        config = self._before_friction()
         task = response_task(config, self._response_options())
         found, records, plan = measured_response(task, self.carrier)
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
         fit = fit_joint(found, config.joint.inertia_kgm2)
+        require_one_joint(task, plan, records, fit)
         return {**found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found}
+
+    def _before_friction(self) -> Config:
+        """A friction that may be wrong by any factor is no help: what is known is the torque that moved the joint."""
+        numbers = [finding["numbers"].get("break_away_Nm", 0.0) for finding in self.state["direction"]]
+        return with_break_away(self.config, max(numbers)) if max(numbers) > 0.0 else without_friction(self.config)
 
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
@@ -240,12 +256,19 @@ class Tune:
         return values_of_fit(self.original, self.fit, source)
 
     def _with_control(self, control: Control) -> Config:
-        update: dict[str, Any] = {"control": control}
+        update: dict[str, Any] = {"control": control, "limits": self._limits_with(control)}
         second = self.config.joint_encoder
         if second is not None and self.config.encoder.side == "motor":
             law = "joint_encoder" if control.kind == "flexible_joint" else "encoder"
             update["joint_encoder"] = second.model_copy(update={"law": law})
         return self.config.model_copy(update=update)
+
+    def _limits_with(self, control: Control) -> Limits:
+        """A joint that stands may flip by one count, which a quick filter reads as a speed that is no standstill."""
+        limits = self.original.limits
+        flip_radps = rounded(STANDS * velocity_of_a_count_radps(self.config.model_copy(update={"control": control})))
+        standstill_radps = max(limits.standstill_radps, min(flip_radps, STANDSTILL_SHARE * limits.velocity_max_radps))
+        return self.config.limits.model_copy(update={"standstill_radps": standstill_radps})
 
     def _chosen(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
@@ -284,7 +307,7 @@ class Tune:
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
         options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
-        command = Sweep(without_friction(self.config), self.carrier.quietly(), path, options)
+        command = Sweep(self._before_friction(), self.carrier.quietly(), path, options)
         command.control = control = self.carrier.control
         try:
             ended = command.run()
@@ -328,9 +351,19 @@ class Tune:
     # --- 6. gains ---
 
     def _step_gains(self) -> dict[str, Any]:
+        self._require_same_joint("before the gains")  # a law that is chosen for another joint may swing
         self.gains = self._chosen(self.options.law, self.options.objective)
         self._require(self.gains)
         return self._kept(self.gains)
+
+    def _require_same_joint(self, when: str) -> None:
+        assert self.fit is not None
+        assert self.response is not None
+        config = self._before_friction()
+        try:
+            require_same_joint(config, self.carrier, self.response.peak_Nm, self.fit, when)
+        except MarginError as error:  # the law of the response, on the joint that is known to be soft now
+            self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 
     @staticmethod
     def _kept(gains: ChosenGains) -> dict[str, Any]:
@@ -358,6 +391,7 @@ class Tune:
 
     def _step_verification(self) -> dict[str, Any]:
         found = {"after": self._verified(self.config, "verification")}
+        self._require_same_joint("after the verification")
         before = self._before()
         try:
             require_margin(before)
@@ -452,6 +486,10 @@ class Tune:
         second, chosen = self.original.joint_encoder, self.config.joint_encoder
         if second is not None and chosen is not None and second.law != chosen.law:
             values.append(Found(("joint_encoder",), "law", chosen.law, f"{chosen.law}, of the law {gains['law']}"))
+        standstill_radps = self.config.limits.standstill_radps
+        if standstill_radps != self.original.limits.standstill_radps:
+            source = f"{standstill_radps:g}: one count of the encoder reads as {standstill_radps / STANDS:.2g} rad/s"
+            values.append(Found(("limits",), "standstill_radps", standstill_radps, source))
         virtual = self.config.virtual
         if virtual is not None and virtual != self.original.virtual:
             kept = "the virtual joint stays what it was"

@@ -1,0 +1,138 @@
+"""`tune` on joints that are not as they should be, in simulated time: off, one line that says what was seen, data kept.
+
+Faults are those of [[virtual.faults]], which begin anew with each motion: one that begins late spares the short ones.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import JointctlError, MotionFault
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.output import Output
+from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.session.plan import Motion
+from jointctl.tools.tuning.carry_out import Carried, Carrier
+from jointctl.tools.tuning.tune_options import TuneOptions
+from jointctl.tools.verbs.tune_steps import Tune
+from tests.configurations import changed, written
+
+OFF = ("switch on disabled", "ready to switch on", "switched on", "fault")  # states of the drive without power
+
+
+class Watched(Carrier):
+    """Keeps what the joint weighs from motion to motion: `heavier` times from the `since`-th motion on."""
+
+    heavier, since, motions = 1.0, 1_000, 0
+
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+        self.motions += 1
+        assert config.virtual is not None
+        if self.motions >= self.since:
+            config = changed(config, virtual__inertia_scale=self.heavier * config.virtual.inertia_scale)
+        return super().run(config, motion, title, also_faults=also_faults)
+
+
+class PutOnMidway(Watched):
+    """A payload that is put on in the middle of the `since`-th motion: its second half is that of a heavier joint."""
+
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+        carried = super().run(config, motion, title, also_faults=also_faults)
+        if self.motions != self.since:
+            return carried
+        self.since = 1_000
+        light = super().run(config, motion, title, also_faults=also_faults)
+        rows = light.records.trajectory_s < 0.5 * float(np.max(light.records.trajectory_s))
+        before = light.records[rows & (light.records.phase == AxisPhase.TRACKING)]
+        after = carried.records[carried.records.trajectory_s > before.trajectory_s[-1]]
+        return replace(carried, records=np.concatenate((before, after)).view(np.recarray))
+
+
+def ended(path: Path, carrier: Watched, text: str) -> tuple[str, dict[str, Any]]:
+    """(the line, steps that were kept) of a tune that ends; the drive is off and the file as it was."""
+    folder = path.with_suffix(".tune")
+    with pytest.raises(JointctlError) as raised:
+        Tune(load_config(path), TuneOptions(lockstep=True), carrier, folder).run()
+    assert isinstance(raised.value, MotionFault)
+    line = raised.value.message
+    assert "\n" not in line
+    assert "is as it was" in line
+    assert path.read_text() == text
+    assert carrier.drive_state in OFF
+    kept = folder / "steps.json"
+    return line, json.loads(kept.read_text()) if kept.exists() else {}
+
+
+def watched(kind: type[Watched] = Watched) -> Watched:
+    output = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    return kind(output, TerminalConsent(output, assume_yes=True), None)
+
+
+def with_fault(path: Path, kind: str, at_s: float, **keys: float) -> str:
+    lines = "".join(f"{key} = {value}\n" for key, value in keys.items())
+    text = path.read_text() + f'\n[[virtual.faults]]\nkind = "{kind}"\nat_s = {at_s}\n{lines}'
+    path.write_text(text)
+    return text
+
+
+@pytest.mark.parametrize(
+    ("kind", "at_s", "line", "steps"),
+    [
+        ("encoder_reversed", 0.0, r"direction: by \[encoder\] the joint moved against the torque", 0),
+        ("torque_reversed", 0.0, r"direction: by \[encoder\] the joint moved against the torque", 0),
+        ("frames_lost", 1.0, r"direction: ended while the joint moved: STALE_SAMPLE", 0),
+        ("frames_lost", 12.0, r"response: .*STALE_SAMPLE", 1),
+        ("frames_lost", 120.0, r"friction: .*STALE_SAMPLE", 3),
+        ("current_loop_dead", 12.0, r"response: .*(POSITION_FROZEN|FOLLOWING_ERROR|TORQUE_SATURATED)", 1),
+    ],
+)
+def test_a_fault_in_a_step_ends_it_in_one_line(tmp_path: Path, kind: str, at_s: float, line: str, steps: int) -> None:
+    path = written(tmp_path / "joint.toml", "precise")
+    text = with_fault(path, kind, at_s)
+    carrier = watched()
+    said, kept = ended(path, carrier, text)
+    assert re.match(line, said), said
+    assert len([name for name in kept if name not in ("about", "asked")]) == steps
+    if steps == 3:
+        assert len((path.with_suffix(".tune") / "friction.csv").read_text().splitlines()) > 3
+
+
+@pytest.mark.parametrize(("since", "steps"), [(6, 5), (8, 6)])
+def test_a_payload_between_the_steps_is_seen_before_gains_and_after_the_verification(
+    tmp_path: Path, since: int, steps: int
+) -> None:
+    path = written(tmp_path / "joint.toml", "precise")
+    carrier = watched()
+    carrier.heavier, carrier.since = 1.3, since
+    said, kept = ended(path, carrier, path.read_text())
+    assert "the joint is another one: 2.1" in said
+    assert len([name for name in kept if name not in ("about", "asked")]) == steps
+
+
+def test_a_payload_that_is_put_on_during_the_response_is_seen(tmp_path: Path) -> None:
+    path = written(tmp_path / "joint.toml", "precise")
+    carrier = watched(PutOnMidway)
+    carrier.heavier, carrier.since = 1.5, 5
+    said, kept = ended(path, carrier, path.read_text())
+    assert "the joint is another one: 2.1" in said
+    assert "in the second half" in said
+    assert "direction" in kept
+
+
+def test_a_joint_that_stays_the_same_is_none_of_this(tmp_path: Path) -> None:
+    """The twin: a little heavier than the limit allows to tell, and no fault."""
+    path = written(tmp_path / "joint.toml", "precise")
+    carrier = watched()
+    carrier.heavier, carrier.since = 1.03, 6
+    Tune(load_config(path), TuneOptions(lockstep=True), carrier, path.with_suffix(".tune")).run()
+    assert "tuned by jointctl" in path.read_text()
