@@ -28,12 +28,13 @@ _CONTROL = re.compile(
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 _INDENTED_BREAK = re.compile(r"[ \t]*\n[ \t]+|[ \t]+\n")
 _WORD = re.compile(rf"([(=\"']{{0,3}})(\S{{{LONGEST_VALUE - 5},}}?)([)\"':;,.]{{0,3}})(?!\S)")
-# a value in brackets, or in quotes that are no apostrophe; what begins a line up to a colon is the name of a file
+# a value in brackets, or in quotes that are no apostrophe; what begins a line up to a colon is the name of a file, or
+# a sentence where a value stands in it
 _VALUES = (
     re.compile(r"(?<=\(=).*?(?=\)(?:[ :,;.]|$))"),
     re.compile(r"(?<!\w)'.*?'(?!\w)"),
     re.compile(r'(?<!\w)".*?"(?!\w)'),
-    re.compile(r"^[^:]*(?=: )"),
+    re.compile(r"^(?![^:]* \(=)[^:]*(?=: )"),
 )
 
 

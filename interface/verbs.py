@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, MotionFault, UsageError
 
 if TYPE_CHECKING:
+    from jointctl.tools.analysis.reducer_map import FoundMap
     from jointctl.tools.experiments.controller_study import StudyResult
     from jointctl.tools.experiments.judge import Verdict
     from jointctl.tools.identification.identification import Identification
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.recording.run_log_reader import RunLog
     from jointctl.tools.session.result import RunResult
+    from jointctl.tools.tuning.frequency_response import FrequencyResponse
+    from jointctl.tools.tuning.joint_fit import JointFit
     from jointctl.tools.verbs.check import LoopCheck
     from jointctl.tools.verbs.excite import ExciteResult
     from jointctl.tools.verbs.paper import PaperResult
@@ -37,6 +40,10 @@ run: Callable[..., RunResult | None]
 check: Callable[..., LoopCheck]
 sweep: Callable[..., SweepResult | None]
 excite: Callable[..., ExciteResult | None]
+response: Callable[..., tuple[FrequencyResponse, JointFit] | None]
+map: Callable[..., FoundMap | None]
+tune: Callable[..., dict[str, Any] | None]
+demo: Callable[..., RunResult]
 validate: Callable[..., Validation]
 report: Callable[..., Path]
 study: Callable[..., StudyResult]
@@ -46,6 +53,9 @@ doctor: Callable[..., list[Finding]]
 scan: Callable[..., dict[str, Any]]
 info: Callable[..., dict[str, Any]]
 stop: Callable[..., str]
+clear_fault: Callable[..., str]
+zero: Callable[..., dict[str, Any]]
+new: Callable[..., None]
 
 VERBS = tuple(__annotations__)
 _ANSWERS = {"doctor": JointctlError.exit_code, "fault_campaign": 10}  # exit codes that the result explains

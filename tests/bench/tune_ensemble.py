@@ -1,6 +1,7 @@
 """`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
 
     python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft] [--workers 2] [--csv FILE]
+                                       [--cluster tls://HOST:8786]
 
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
 reducer and two encoders) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no
@@ -19,7 +20,6 @@ import argparse
 import csv
 import io
 import math
-import multiprocessing
 import os
 import sys
 import tempfile
@@ -42,6 +42,7 @@ from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.configuration.sections import Friction  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
+from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
 from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
@@ -244,15 +245,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=90701)
     parser.add_argument("--plants", type=int, default=40)
     parser.add_argument("--soft", action="store_true")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--cluster", help="address of a dask scheduler: docs/cluster.md")
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
     tasks = [(given.seed, index, given.soft) for index in range(given.plants)]
     rows: list[dict[str, Any]] = []
-    with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
-        for row in pool.imap(tuned, tasks):
-            rows.append(row)
-            print(row, flush=True)
+    for row in Workers(given.workers, given.cluster).results(tuned, tasks):
+        rows.append(row)
+        print(row, flush=True)
+    rows.sort(key=lambda row: int(row["plant"]))
     good = [row for row in rows if "failed" not in row]
     for row in good:
         row["ratio"] = row["rmse_mrad"] / row["rmse_true_mrad"]

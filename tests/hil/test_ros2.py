@@ -132,8 +132,15 @@ def test_enable_and_set_points_garbage_a_second_source_and_silence(bench: Any) -
 
 def test_an_approval_that_is_stopped_enables_nothing(bench: Any) -> None:
     run = Run(bench, "--allow-remote")
+    reports: list[Any] = []
     with run.client() as client:
+        client.collect("/diagnostics", DIAGNOSTICS, lambda report, _: reports.append(report))
         run.program.saw("waiting up to")
+        give_up_s = time.monotonic() + 20.0
+        while not reports:  # who is to enable it sees that it waits
+            assert time.monotonic() < give_up_s
+            time.sleep(0.05)
+        assert [(found.name, found.message) for found in reports[0].status] == [("joint: joint", ros2_server.WAITING)]
         assert client.call("/joint/stop")[0]
     ended = run.program.finished(60.0)
     assert ended.code == 12, ended.err

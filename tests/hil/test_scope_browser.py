@@ -27,6 +27,14 @@ pytestmark = [
 LAST_s = "(() => { const c = document.querySelector('[data-testid=\"chart\"]'); const o = getElement(c.id.slice(1)).chart.getOption(); const d = o.series[0].data; return d[d.length - 1][0] })()"  # noqa: E501
 ZOOM = "getElement(document.querySelector('[data-testid=\"chart\"]').id.slice(1)).chart"
 
+# after a rest before it began, the axis has every value of the angle in it, and most of its length is used
+SEEN = f"""(() => {{
+  const chart = {ZOOM}, values = chart.getOption().series[1].data.map(pair => pair[1]).filter(value => value !== null)
+  const [low, high] = chart.getModel().getComponent('yAxis', 0).axis.scale.getExtent()
+  const least = Math.min(...values), greatest = Math.max(...values)
+  return greatest - least > 0.05 && low <= least && greatest <= high && greatest - least > 0.3 * (high - low)
+}})()"""
+
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Browser]:
@@ -104,6 +112,7 @@ def test_nothing_moves_before_start_and_stop_stops(bench: Any, browser: Browser)
     assert bench.is_pre_operational()
     start(tab)
     moves(tab)
+    tab.until(SEEN)
     tab.enter("set-point", "-0.2")
     tab.click("go")
     told = "set-point -0.2000 rad, until stopped, by"

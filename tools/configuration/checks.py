@@ -43,9 +43,10 @@ def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_rad
     limits = config.limits
     allowed = f"[{limits.position_min_rad:g}..{limits.position_max_rad:g}]"
     found = []
-    for end, value in (("lowest", low_rad), ("highest", high_rad)):
+    ends = {"position": low_rad} if low_rad == high_rad else {"lowest position": low_rad, "highest position": high_rad}
+    for end, value in ends.items():
         if not limits.position_min_rad <= value <= limits.position_max_rad:
-            found.append(f"trajectory: {end} position (={value:g} rad) must be in {allowed}, the limits.position_*_rad")
+            found.append(f"trajectory: {end} (={value:g} rad) must be in {allowed}, the limits.position_*_rad")
     if not speed_radps <= limits.velocity_max_radps:
         found.append(
             f"trajectory: peak speed (={speed_radps:g} rad/s) must be in [0..{limits.velocity_max_radps:g}], "

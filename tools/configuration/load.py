@@ -92,7 +92,13 @@ def read_document(path: Path) -> tuple[str, dict[str, Any]]:
     try:
         return text, parse_toml(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+        raise ConfigurationError(f"{path}: not valid TOML: {error}{_line_of(text, str(error))}") from None
+
+
+def _line_of(text: str, problem: str) -> str:
+    """`: kp = `, the line that a message of the TOML reader names by its number; "" where it names none."""
+    found, lines = re.search(r"at line (\d+)", problem), text.splitlines()
+    return f": {lines[int(found[1]) - 1].strip()}" if found is not None and int(found[1]) <= len(lines) else ""
 
 
 def config_of(path: Path, text: str, data: dict[str, Any]) -> Config:

@@ -90,7 +90,7 @@ class Chart:
             ui.button("reset zoom", on_click=self._reset_zoom, color=None).props("flat dense no-caps")
         with ui.row().classes("w-full items-center gap-3"):
             self._armed = ui.switch("trigger", on_change=self._on_arm).props('dense data-testid="trigger"')
-            self._source = ui.select(list(SIGNALS), value="angle [rad]", label="on").classes("w-48")
+            self._source = ui.select(list(SIGNALS), value="angle [rad]", label="source").classes("w-48")
             self._source.props("dense options-dense")
             self._edge = ui.toggle({True: "rising", False: "falling"}, value=True).props("dense no-caps")
             self._level = ui.number("level", value=0.0, format="%.4g").classes("w-24").props("dense")
@@ -234,9 +234,9 @@ class Chart:
         units = list(dict.fromkeys(name[name.index("[") :] for name in names))
         options, plain = self._chart.options, {"color": self._text}
         options["xAxis"]["name"] = "s" if over_time else found.x_name
-        log = {"type": "log"} if view == SPECTRUM else None
+        log = {"type": "log", "min": None, "max": None} if view == SPECTRUM else None
         options["yAxis"] = [
-            {**_AXIS, **(log or _ends(unit, series)), "name": unit, "position": "left" if i == 0 else "right",
+            {**_AXIS, **(log or axis_ends(unit, series)), "name": unit, "position": "left" if i == 0 else "right",
              "offset": max(0, i - 1) * 56, "axisLabel": plain, "nameTextStyle": {"fontSize": 12, **plain}}
             for i, unit in enumerate(units or [""])
         ]  # fmt: skip
@@ -258,11 +258,12 @@ class Chart:
             self._chart.run_chart_method("setOption", options, True)
 
 
-def _ends(unit: str, series: Mapping[str, Sequence[Sequence[float | None]]]) -> dict[str, float]:
-    """`min` and `max` of the axis of a unit, where it does not fit itself to its signals."""
+def axis_ends(unit: str, series: Mapping[str, Sequence[Sequence[float | None]]]) -> dict[str, float | None]:
+    """`min` and `max` of the axis of a unit; None where it fits itself to its signals: without it the old ones stay."""
     values = [pair[1] for name, data in series.items() if name.endswith(unit) for pair in data if pair[1] is not None]
     found = axis_range(min(values), max(values), unit) if values and unit else None
-    return {} if found is None else {"min": found[0], "max": found[1]}
+    low, high = found or (None, None)
+    return {"min": low, "max": high}
 
 
 def _options() -> dict[str, Any]:

@@ -16,10 +16,12 @@ from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
 
+import numpy as np
+
 from jointctl.drivers.errors import DataError, UsageError, printable
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
-from jointctl.tools.recording.ros_messages import JOINT_NAMES
+from jointctl.tools.recording.ros_messages import JOINT_NAMES, StateCycles
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
@@ -27,6 +29,7 @@ RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message; of recor
 REQUESTS = 16  # of viewers, at most between two looks
 AT_ONCE = 64  # messages of a server that are read in one look: it must not hold the supervisor up
 PIECE = 64  # records a message; less than the buffer of the socket
+STATES_S = 0.05  # between two messages of a feed of states
 COUNT_AGAIN_S = 2.0  # how often the server tells the number of open pages, changed or not
 SILENT_S = 3.0 * COUNT_AGAIN_S  # without that word nobody is there: the server hangs, and STOP with it
 SERVER_SILENT = (
@@ -84,7 +87,8 @@ class ScopeFeed:
 
     `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
     page has been open for so long; None = it goes on.  In any case it is reported in the terminal and the log.
-    `takes`: the kinds of requests that are passed on besides STOP; None = all.
+    `takes`: the kinds of requests that are passed on besides STOP; None = all.  `states`: of each hundredth of a second
+    only the first record is passed on, `STATES_S` together: each message wakes server and clients, beside the loop.
     """
 
     def __init__(
@@ -95,8 +99,11 @@ class ScopeFeed:
         unwatched_s: float | None = None,
         server: str = SCOPE,
         takes: frozenset[str] | None = None,
+        states: bool = False,
     ) -> None:
-        self._end, self._server, self._takes = end, server, takes
+        self._end, self._server, self._takes, self._states = end, server, takes, states
+        self._held: dict[int, tuple[StateCycles, list[Any]]] = {}  # of each joint what goes with the next message
+        self._next_s = 0.0
         end.setblocking(False)
         self._in_charge, self._unwatched_limit_s = in_charge, unwatched_s
         self.dropped = 0  # messages
@@ -106,7 +113,7 @@ class ScopeFeed:
         self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
         self._viewers = 0
         self._counted_s: float | None = None  # when the server reported their number last
-        self._temperature_degC: float | None = None  # as it was passed on
+        self._told: dict[str, Any] = {"temperature_degC": None}  # of the newest cycle, besides its records
         self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
     def send(self, kind: bytes, body: bytes) -> None:
@@ -123,11 +130,33 @@ class ScopeFeed:
         """So are phases."""
 
     def show(self, snapshot: Snapshot) -> None:
-        if snapshot.axis == 0 and snapshot.temperature_degC != self._temperature_degC:
-            self._temperature_degC = snapshot.temperature_degC
-            self.settings({"temperature_degC": self._temperature_degC})
-        for at in range(0, len(snapshot.records), PIECE):
-            self.send(RECORDS, bytes([snapshot.axis]) + snapshot.records[at : at + PIECE].tobytes())
+        told: dict[str, Any] = {"temperature_degC": snapshot.temperature_degC}
+        if self._states:
+            told["skipped"] = snapshot.skipped  # a server of all records counts them
+        if snapshot.axis == 0 and told != self._told:
+            self._told = told
+            self.settings(told)
+        if self._states:
+            self._hold(snapshot)
+        else:
+            self._send_records(snapshot.axis, snapshot.records)
+
+    def _send_records(self, axis: int, records: Any) -> None:
+        for at in range(0, len(records), PIECE):
+            self.send(RECORDS, bytes([axis]) + records[at : at + PIECE].tobytes())
+
+    def _hold(self, snapshot: Snapshot) -> None:
+        cycles, held = self._held.setdefault(snapshot.axis, (StateCycles(), []))
+        held.append(cycles.take(snapshot.records)[:, 0])
+        if snapshot.axis == 0 and (now_s := time.monotonic()) >= self._next_s:
+            self._next_s = max(self._next_s + STATES_S, now_s)
+            self._let_go()
+
+    def _let_go(self) -> None:
+        for axis, (_, held) in self._held.items():
+            if held:
+                self._send_records(axis, np.concatenate(held))
+                held.clear()
 
     def event(self, event: Event) -> None:
         self.send(EVENT, json.dumps(asdict(event)).encode())
@@ -223,7 +252,8 @@ class ScopeFeed:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """The server sees the end of the socket when the process that owns it is done with it."""
+        """What is held back goes; the server sees the end of the socket when its owner is done with it."""
+        self._let_go()
 
 
 @contextmanager

@@ -175,7 +175,7 @@ def _served(kind: _Kind, order: RemoteOrder, sources: SetPointSources | None) ->
     with server_process(f"jointctl.tools.scoping.{kind.module}", order, [feeds_end, points_end], [feed, points]):
         _wait_ready(kind, feed)
         _Channel(points, sources or SetPointSources("no one: --allow-remote was not given")).start()
-        yield ScopeFeed(feed, server=kind.name, takes=takes)
+        yield ScopeFeed(feed, server=kind.name, takes=takes, states=True)
 
 
 def _wait_ready(kind: _Kind, feed: socket.socket) -> None:

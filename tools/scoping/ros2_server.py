@@ -12,7 +12,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -159,6 +159,7 @@ ROUTER_AT = "tcp/localhost:7447"  # where every ROS 2 node looks for its router
 DIAGNOSTICS_S = 1.0
 MOST_NODES = 4096  # that are remembered by name
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/msg/DiagnosticStatus
+WAITING = "approved at the terminal; the next call of ~/enable moves the joint"
 NOT_WAITING = "nothing waits for it: it enables once, after the approval at the terminal"
 
 
@@ -307,9 +308,11 @@ class Ros2View:
             self._problem = (_ERROR if event.level >= ERROR else _WARN, f"{event.source}: {event.text}")
 
     def settings(self) -> None:
-        """See `Publisher`: they are in the diagnostics."""
+        """See `Publisher`: they are in the diagnostics, also before the loop has records."""
+        if self.view.settings.get("stage") == "approved":
+            self._put_diagnostics(self._diagnostics([None] * len(self._order.names), time.time_ns()))
 
-    def _diagnostics(self, records: np.ndarray, wall_ns: int) -> bytes:
+    def _diagnostics(self, records: Sequence[np.void | None] | np.ndarray, wall_ns: int) -> bytes:
         types = self._types.types
         sec, nanosec = divmod(wall_ns, SECOND_NS)
         found = types[DIAGNOSTICS](
@@ -320,10 +323,11 @@ class Ros2View:
         )
         return bytes(self._types.serialize_cdr(found, DIAGNOSTICS))
 
-    def _status(self, name: str, record: np.void) -> Any:
-        """Of one joint."""
-        types, order, settings = self._types.types, self._order, self.view.settings
-        pair, status = types["diagnostic_msgs/msg/KeyValue"], types["diagnostic_msgs/msg/DiagnosticStatus"]
+    def _status(self, name: str, record: np.void | None) -> Any:
+        """Of one joint; without a record it waits to be enabled."""
+        if record is None:
+            return self._shown(name, _OK, WAITING, {"newest refusal": self._refusal})
+        order, settings = self._order, self.view.settings
         fault, (level, problem) = int(record["fault"]), self._problem
         values: dict[str, object] = {
             "position_rad": f"{record['position_rad']:.6g}",
@@ -335,11 +339,17 @@ class Ros2View:
             phase = phase_name(int(record["phase"]))
             values |= {"phase": phase, "drive": drive, "fault": fault_name(fault) if fault else "none"}
             values |= {"motion": settings.get("motion"), "temperature_degC": settings.get("temperature_degC")}
-            values |= {"newest event": problem, "newest refusal": self._refusal, "skipped": int(record["skipped"])}
+            values |= {"newest event": problem, "newest refusal": self._refusal}
+            values |= {"skipped": settings.get("skipped")}  # cycles since the start
             level = _ERROR if fault else level
             message = f"{phase}: {fault_words(fault)}" if fault else phase
+        return self._shown(name, level, message, values)
+
+    def _shown(self, name: str, level: int, message: str, values: Mapping[str, object]) -> Any:
+        types = self._types.types
+        pair, status = types["diagnostic_msgs/msg/KeyValue"], types["diagnostic_msgs/msg/DiagnosticStatus"]
         shown = [pair(key=key, value=str(value)) for key, value in values.items() if value not in (None, "")]
-        return status(level=level, name=f"{order.joint}: {name}", message=message, hardware_id="", values=shown)
+        return status(level=level, name=f"{self._order.joint}: {name}", message=message, hardware_id="", values=shown)
 
 
 def set_point_of(who: str, point: Any, joints: int = 1) -> RemoteSetPoint:

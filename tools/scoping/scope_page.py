@@ -237,13 +237,13 @@ class ChangePanels:
                 self._kind = ui.select(kinds, value="configured", on_change=self._on_kind).classes("w-full")
                 self._kind.props('dense options-dense data-testid="kind"')
                 self._fields = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
-                _button("Follow it", self._follow, "follow")
+                _button("Apply trajectory", self._follow, "follow")
             ui.label(ENDLESS).classes("text-xs scope-aside")
             with _card("Gains"):
                 self._gain_rows = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
                 _button("Apply", self._apply, "apply")
             self._record = _button("Record", self._on_record, "record").classes("w-full")
-            self._recorded = ui.label("the run log has everything in any case").classes("text-xs scope-aside")
+            self._recorded = ui.label("the run log always records everything").classes("text-xs scope-aside")
 
     def _ask(self, kind: str, values: dict[str, Any]) -> None:
         self._asked = kind
@@ -297,7 +297,7 @@ class ChangePanels:
         self._show_refusal(settings.get("refused"))
         self._recording = bool(settings.get("recording"))
         self._record.text = "Stop recording" if self._recording else "Record"
-        self._recorded.text = str(settings.get("recording") or "the run log has everything in any case")
+        self._recorded.text = str(settings.get("recording") or "the run log always records everything")
 
     def _show_refusal(self, refused: Mapping[str, Any] | None) -> None:
         """At the fields that it names, or at all of that request."""
@@ -353,6 +353,8 @@ CSS = (
     ".q-field__label{font-size:13px} body{font-size:14px} .nicegui-content{padding:0 14px 10px; gap:8px}"
     " .scope-head{position:sticky; top:0; z-index:10; background:#fff; padding:10px 0 4px}"
     " .body--dark .scope-head{background:#121212} .scope-aside{color:#5f5f5f} .body--dark .scope-aside{color:#b0b0b0}"
+    # what is refused takes as many lines as it needs, below its field
+    " .q-field--with-bottom{padding-bottom:0} .q-field__bottom--animated{position:static; transform:none}"
     " .scope-bad{color:#c62828; font-weight:600} .body--dark .scope-bad{color:#ff8a80}"
     " :focus-visible{outline:3px solid #1f5fa8; outline-offset:2px} .body--dark :focus-visible{outline-color:#6fa8e8}"
     " @media (max-width: 900px) {.scope-body{flex-wrap:wrap} .scope-body>*{width:100%}}"

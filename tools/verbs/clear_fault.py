@@ -28,5 +28,5 @@ def clear_fault(config: JointOnBus, output: ResultOutput) -> int:
             return INTERRUPTED
         finally:
             drive.close()
-    output.result(done, {"result": done})
+    output.result(done, {"result": done}, done)
     return 0

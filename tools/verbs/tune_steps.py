@@ -549,7 +549,7 @@ class Tune:
         output = self.carrier.output
         data = {**self.state, "values": [[".".join(one.section), one.key, one.value] for one in self._values()]}
         output.result(fitted)
-        output.result(loop, data, self.state)
+        output.result(loop, data)
         assert self.response is not None
         gains = self.gains or self._chosen(self.options.law, self.options.objective)
         pictures: list[Any] = [

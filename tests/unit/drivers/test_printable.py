@@ -44,6 +44,18 @@ def test_what_is_only_shown_stays() -> None:
         assert message_line(text) == text
 
 
+def test_a_file_s_name_is_cut_and_a_sentence_with_values_before_its_colon_is_not() -> None:
+    text = (
+        "joint.torque_constant_NmpA (=100 in the drive's ampere) times drive.rated_current_A (=5) is 1e+03 times "
+        "drive.rated_torque_Nm (=0.5): one of them is wrong, or rms and sine amplitude are mixed up"
+    )
+    assert len(text) > LONGEST_VALUE
+    assert message_line(text) == text
+    cut = message_line(f"{'long name ' * 40}.toml: no such file (=1)")
+    assert len(cut) < LONGEST_VALUE + 30
+    assert cut.endswith(".toml: no such file (=1)")
+
+
 @given(st.text(max_size=400))
 def test_twice_is_once_and_a_line_is_a_line(text: str) -> None:
     once = message_line(text)

@@ -80,6 +80,23 @@ def test_results_come_as_objects_and_nothing_is_printed(tmp_path: Path, capsys: 
         jointctl.sweep("sweep_virtual", out=data, lockstep=True)
 
 
+def test_what_a_frequency_response_shows_is_a_result(tmp_path: Path) -> None:
+    found, fit = jointctl.response(
+        "virtual", lockstep=True, legs=8, out=tmp_path / "r.json", figure=tmp_path / "r.png", quiet=True
+    )
+    assert len(found.frequency_Hz) > 10
+    assert fit.values["inertia_kgm2"].value == pytest.approx(2.1, rel=0.1)
+
+
+def test_a_configuration_is_written_and_a_shipped_one_is_not_tuned(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    assert jointctl.new(path, shipped="precise", quiet=True) is None
+    assert jointctl.check(path).verdict == "ok"
+    assert jointctl.tune(path, lockstep=True, dry_run=True, quiet=True) is None
+    with pytest.raises(jointctl.ConfigurationError, match="is not changed"):
+        jointctl.tune("precise", lockstep=True)
+
+
 def test_what_the_doctor_finds_is_a_result_and_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     bad = Finding("bus", PROBLEM, "there is none", "make one")
     monkeypatch.setattr(import_module("jointctl.tools.verbs.doctor"), "findings", lambda config, cold: iter([bad]))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import io
+import json
 import math
 import os
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -20,7 +22,7 @@ from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED, DataError, MotionFault, UsageError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
-from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
@@ -174,6 +176,28 @@ def test_records_and_events_arrive_as_they_were(ends: tuple[socket.socket, socke
     assert kinds == [RECORDS] * -(-count // PIECE) + [EVENT]
     np.testing.assert_array_equal(history.newest(1e9), records(count))
     assert feed.dropped == 0
+
+
+def test_a_feed_of_states_passes_on_few_records_in_few_messages_and_all_in_the_end(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, feed = Clock(monkeypatch), ScopeFeed(ends[0], states=True)
+    looks = 25
+    with feed:
+        for look in range(looks):
+            clock.now_s = look * 0.02
+            for axis in (0, 1):
+                feed.show(replace(snapshot(records(20, 20 * look)), skipped=3, temperature_degC=25.0, axis=axis))
+    ends[0].close()
+    messages = list(iter(lambda: ends[1].recv(1 << 20), b""))
+    assert [json.loads(found[1:]) for found in messages if found[:1] == SETTINGS] == [
+        {"stage": "running"}, {"temperature_degC": 25.0, "skipped": 3}
+    ]  # fmt: skip
+    for axis in (0, 1):
+        bodies = [found[2:] for found in messages if found[:1] == RECORDS and found[1] == axis]
+        cycles = np.frombuffer(b"".join(bodies), dtype_of(LogRecord))["cycle"]
+        np.testing.assert_array_equal(cycles, np.arange(0, 20 * looks, 10))
+        assert len(bodies) <= looks * 0.02 / feed_module.STATES_S + 2
 
 
 def test_a_server_that_reads_nothing_or_is_gone_costs_the_run_nothing(
@@ -528,6 +552,16 @@ def test_noise_is_not_magnified(low: float, high: float, unit: str, fits_itself:
         assert found[0] < low <= high < found[1]
         assert found[1] - found[0] == pytest.approx(1.5 * chart.LEAST_SPAN[unit])
         assert chart.axis_range(low + 1e-9, high + 1e-9, unit) == found
+
+
+def test_an_axis_follows_its_signals_again_once_they_move() -> None:
+    chart = pytest.importorskip("jointctl.tools.scoping.chart")
+    rest, motion = [[0.0, 0.1], [1.0, 0.10001]], [[0.0, 0.1], [1.0, None], [2.0, 0.35]]
+    resting = chart.axis_ends("[rad]", {"angle [rad]": rest})
+    assert resting["min"] < 0.1 < 0.10001 < resting["max"]
+    # named, though there are none: a chart keeps what it is not given
+    assert chart.axis_ends("[rad]", {"angle [rad]": motion}) == {"min": None, "max": None}
+    assert chart.axis_ends("[Nm]", {"angle [rad]": rest}) == {"min": None, "max": None}
 
 
 def test_every_signal_has_a_least_span() -> None:
