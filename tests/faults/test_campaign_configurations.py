@@ -174,6 +174,16 @@ def test_where_the_velocity_filter_passes_more_a_harmless_reordering_is_one_swap
         assert fitted(config, other) == other
 
 
+def test_there_a_reading_that_stands_still_for_one_sample_is_harmless() -> None:
+    """`precise`, seed 20261125, scenario 299: two of them read as 1.26 rad/s afterwards, at a true 0.6 rad/s."""
+    config, joint = campaign_joint(load_config(CONFIGS / "precise.toml"), "run")
+    twin = draw_scenario(20261125, 299)
+    assert (twin.kind, twin.harmless) == (FaultKind.ENCODER_STUCK, True)
+    assert fitted(config, twin).duration_s == 0.5e-3
+    assert judge(config, joint, twin).violations == ()
+    assert fitted(shipped(), twin) == twin
+
+
 @pytest.mark.parametrize(("load_Nm", "fits"), [(9.59, True), (9.6, False)])
 def test_a_load_that_friction_does_not_hold_has_no_envelope(load_Nm: float, fits: bool) -> None:
     """0.9 x 121 x 0.1063 Nm x 0.95 - 1.4 Nm of ripple."""

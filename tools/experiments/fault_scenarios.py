@@ -456,14 +456,16 @@ def fitted(config: Config, scenario: Scenario) -> Scenario:
 
     A swapped sample reads as half the speed and the next one as twice that.  The filter of configs/virtual.toml lets
     any number of swaps pass for harmless; one that passes more reads two in a row as 1.8 times the speed, and 0.6 rad/s
-    as more than the limit: there a harmless reordering is one swap.
+    as more than the limit: there a harmless reordering is one swap.  So it is with a reading that stands still for two
+    samples and then leaps by three: there it stands still for one.
     """
-    if scenario.kind is not FaultKind.TPDO_REORDERED or not scenario.harmless:
+    if scenario.kind not in (FaultKind.TPDO_REORDERED, FaultKind.ENCODER_STUCK) or not scenario.harmless:
         return scenario
     period_s = 1.0 / config.loop.rate_Hz
     if low_pass_gain(config.control.velocity_cutoff_Hz, period_s) <= low_pass_gain(*FILTER_OF_SWAPS):
         return scenario
-    return replace(scenario, duration_s=1.5 * period_s, magnitude=1.0)
+    cycles = 1.5 if scenario.kind is FaultKind.TPDO_REORDERED else 0.5
+    return replace(scenario, duration_s=cycles * period_s, magnitude=1.0)
 
 
 def plant_of(config: Config, scenario: Scenario, position_rad: float) -> tuple[Any, Any]:
