@@ -18,6 +18,7 @@ import logging
 import os
 import re
 import socket
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from inspect import Parameter, signature
@@ -231,6 +232,18 @@ def normalised(bus: can.BusABC) -> can.BusABC:
     return bus
 
 
+_KERNEL_HAS = ("pcan", "kvaser", "gs_usb", "candle")  # adapters that Linux has as network interfaces
+_AS_SOCKETCAN = (
+    "on Linux the kernel's driver is enough: sudo ip link set can0 up type can bitrate 1000000, then "
+    "-i socketcan -c can0 (docs/adapters.md)"
+)
+
+
+def _remedy(interface: str, elsewhere: str) -> str:
+    """What helps where a library of the maker is missing."""
+    return _AS_SOCKETCAN if sys.platform == "linux" and interface in _KERNEL_HAS else elsewhere
+
+
 @_without_its_log()
 def open_python_can(
     interface: str, channel: str, bitrate: int | None = None, *, exclusive: bool = True, **settings: Any
@@ -264,9 +277,13 @@ def open_python_can(
         return normalised(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError
         known_interface(interface)
-        raise BusError(f"interface {interface} cannot be used here: {error}", "install its driver") from None
+        raise BusError(
+            f"interface {interface} cannot be used here: {error}", _remedy(interface, "install its driver")
+        ) from None
     except ImportError as error:
-        raise BusError(f"interface {interface} needs a module that is not installed: {error}", "install it") from None
+        raise BusError(
+            f"interface {interface} needs a module that is not installed: {error}", _remedy(interface, "install it")
+        ) from None
     except PermissionError:
         remedy = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
         raise BusError(f"no permission to open {place}", f"{remedy}; log in again") from None
@@ -280,7 +297,6 @@ def open_python_can(
         if isinstance(error.__cause__, BusError):
             raise error.__cause__ from None
         if isinstance(error, (can.CanError, ValueError, TypeError)):
-            raise BusError(f"cannot open {place}: {error}") from None
-        raise BusError(
-            f"cannot open {place}: {type(error).__name__}: {error}", f"is the driver of {interface} installed?"
-        ) from None
+            raise BusError(f"cannot open {place}: {error}", _remedy(interface, "")) from None
+        hint = _remedy(interface, f"is the driver of {interface} installed?")
+        raise BusError(f"cannot open {place}: {type(error).__name__}: {error}", hint) from None

@@ -7,6 +7,8 @@ two comes first.  `set-points`: the program sends them.  `foxglove`, `ros2`: the
 topic, on the same cores, or on one (`--client-cpu 0`, where the server is: a client elsewhere takes nothing of the
 others); in the other windows both processes are held.
 
+Of server and client also their processor time and wake-ups a second, which a busy computer changes little.
+
 From the run's log: p99 of the wake-up and of the work in each window, the ratio of each pair, and the median of the
 ratios with its quartiles.
 """
@@ -30,7 +32,7 @@ import typer
 
 import jointctl
 from jointctl.tools.output import Output
-from tests.bench.paired import Row, conditions, outcome_data, outcome_table
+from tests.bench.paired import Row, conditions, measured, outcome_data, outcome_table
 from tests.foxglove_client import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,9 +61,21 @@ def _windows(joint: jointctl.Joint, pairs: int, seconds: float, load: Load) -> l
     return found
 
 
+def _used(pid: int) -> np.ndarray:
+    """Of all threads of a process so far: processor time [ms], and how often they woke up."""
+    total = np.zeros(2)
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        switches = next(line for line in (task / "status").read_text().splitlines() if line.startswith("voluntary"))
+        total += int((task / "schedstat").read_text().split()[0]) * 1e-6, int(switches.split()[1])
+    return total
+
+
 @contextmanager
-def _onlooker(kind: str, port: int, client_cpu: int | None) -> Iterator[Load]:
-    """A client of its own process, which runs, as the server does, only for the windows with it."""
+def _onlooker(kind: str, port: int, client_cpu: int | None, costs: list[list[np.ndarray]]) -> Iterator[Load]:
+    """A client of its own process, which runs, as the server does, only for the windows with it.
+
+    `costs` gets what server and client used a second, for each window.
+    """
     command = [sys.executable, "-m", "tests.bench.onlooker", kind, str(port)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
         if client_cpu is not None:
@@ -69,9 +83,11 @@ def _onlooker(kind: str, port: int, client_cpu: int | None) -> Iterator[Load]:
         pids = [process.pid, _child(f"{kind}_server")]
 
         def look_on(joint: jointctl.Joint, seconds: float) -> None:
+            before = [_used(pid) for pid in pids]
             _signal(pids, signal.SIGCONT)
             joint.wait(seconds)
             _signal(pids, signal.SIGSTOP)
+            costs.append([(_used(pid) - used) / seconds for pid, used in zip(pids, before, strict=True)])
 
         try:
             assert process.stdout is not None
@@ -119,6 +135,7 @@ def client_rows(
     config = config.model_copy(update={"stream": config.stream.model_copy(update=patient)})
     port = free_port()
     at = f"127.0.0.1:{port}"
+    costs: list[list[np.ndarray]] = []
     with ExitStack() as stack:
         stack.enter_context(patch("jointctl.tools.scoping.remote.LISTEN_AT", f"tcp/{at}"))
         joint = stack.enter_context(
@@ -131,12 +148,17 @@ def client_rows(
         if beside == SET_POINTS:
             windows = _windows(joint, pairs, seconds, lambda joint, seconds: _stream(joint, seconds, rate_Hz))
         else:
-            load = stack.enter_context(_onlooker(beside, port, client_cpu))
+            load = stack.enter_context(_onlooker(beside, port, client_cpu, costs))
             windows = _windows(joint, pairs, seconds, load)
     assert joint.log_path is not None
     records = jointctl.read_log(joint.log_path).records
     names = ("wake_late_ns", "wake-up"), ("work_ns", "work")
-    return [_row(records, windows, field, f"{name} with {beside}") for field, name in names]
+    rows = [_row(records, windows, field, f"{name} with {beside}") for field, name in names]
+    for number, who in enumerate(("client", "server") if costs else ()):
+        used = np.array([window[number] for window in costs])
+        rows.append(measured(GROUP, f"processor time a second, {who}", used[:, 0].tolist(), "ms"))
+        rows.append(measured(GROUP, f"wake-ups a second, {who}", used[:, 1].tolist(), ""))
+    return rows
 
 
 def _row(records: Any, windows: list[tuple[bool, int, int]], field: str, name: str) -> Row:

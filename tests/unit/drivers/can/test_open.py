@@ -435,6 +435,27 @@ def test_whatever_an_interface_raises_is_one_bus_error(
     assert len(caplog.records) == 1
 
 
+@pytest.mark.parametrize(
+    "error",
+    [can.CanInterfaceNotImplementedError("no library"), ImportError("No module named 'usb'"),
+     can.CanInitializationError("pcanbasic library not found."), NameError("name 'canOpen' is not defined")],
+    ids=lambda error: type(error).__name__,
+)  # fmt: skip
+@pytest.mark.parametrize(
+    ("interface", "platform", "socketcan"),
+    [("kvaser", "linux", True), ("pcan", "linux", True), ("pcan", "win32", False), ("ixxat", "linux", False)],
+)
+def test_without_its_maker_s_library_an_adapter_that_linux_knows_is_socketcan(
+    opening_raises: Opening, monkeypatch: pytest.MonkeyPatch, error: Exception, interface: str, platform: str,
+    socketcan: bool,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(open_module.sys, "platform", platform)
+    opening_raises(error)
+    with pytest.raises(BusError) as caught:
+        open_python_can(interface, "x")
+    assert ("-i socketcan -c can0" in caught.value.hint) is socketcan
+
+
 @pytest.mark.parametrize(("interface", "remedy"), [("slcan", "sudo usermod -aG dialout $USER"), ("pcan", "group")])
 def test_a_missing_right_is_told_with_its_cure(interface: str, remedy: str, opening_raises: Opening) -> None:
     opening_raises(PermissionError(errno.EACCES, "Permission denied"))
