@@ -11,16 +11,18 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.states import AxisPhase, CommandKind
+from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault
 from jointctl.hil.faults import FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_joint, run_campaign
 from jointctl.tools.experiments.fault_scenarios import (
+    STEPS_THAT_MOVE,
     BEFORE_s,
     LONGEST_s,
     SweepStrokes,
+    TuneStep,
     draw_scenario,
     fitted,
     kinds_during,
@@ -30,6 +32,7 @@ from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
+from jointctl.tools.tuning.campaign_steps import placed_step
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.configurations import shipped
 from tests.faults.campaign_variants import VARIANTS, write_variant
@@ -115,6 +118,47 @@ def test_the_command_that_replays_a_violation_names_the_sweep(tmp_path: Path, mo
     assert fault_campaign(config, shown, count=1, seed=5, folder=tmp_path, workers=Workers(1), sweep=True) == 10
     assert "sweep_virtual.toml --sweep --seed 5 --scenario 0" in err.getvalue()
     assert fault_campaign(config, shown, seed=5, scenario=0, sweep=True) == 10
+
+
+# --- during a tune ---
+@pytest.fixture(scope="module")
+def tuned() -> tuple[Config, LockstepJoint]:
+    return campaign_joint(load_config(CONFIGS / "precise.toml"), "tune")
+
+
+def test_no_scenario_violates_an_invariant_in_the_steps_of_a_tune(tuned: tuple[Config, LockstepJoint]) -> None:
+    drawn = [draw_scenario(880603, number, "tune") for number in range(2 * KINDS)]
+    steps = {one.trajectory.name if isinstance(one.trajectory, TuneStep) else "verification" for one in drawn}
+    assert steps == set(STEPS_THAT_MOVE)
+    found = [judge(*tuned, one, placed_step) for one in drawn]
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 4
+
+
+def test_behind_a_stuck_encoder_no_step_of_a_tune_runs_away(tuned: tuple[Config, LockstepJoint]) -> None:
+    """Scenario 206 of seed 880603 went 3.3 rad/s while nothing knew the torque that moves the joint."""
+    verdict = judge(*tuned, draw_scenario(880603, 206, "tune"), placed_step)
+    assert verdict.fault == "POSITION_FROZEN"
+    assert verdict.violations == ()
+    assert verdict.peak_radps < 1.0
+
+
+def test_a_step_that_ends_by_itself_is_no_false_alarm_of_a_twin(
+    tuned: tuple[Config, LockstepJoint], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only where the same step ends in the same way without the harmless fault."""
+    numbers = (n for n in range(500) if (one := draw_scenario(3, n, "tune")).harmless
+               and isinstance(one.trajectory, TuneStep))  # fmt: skip
+    scenario = draw_scenario(3, next(numbers), "tune")
+    for fault, alone, wrong in ((Fault.LIMIT_CYCLE, Fault.LIMIT_CYCLE, 0), (Fault.LIMIT_CYCLE, Fault.NONE, 1)):
+        faults = iter((fault, alone))
+        real = run_scenario(*tuned, scenario, placed_step)
+        monkeypatch.setattr(
+            judge_module, "run_scenario",
+            lambda *_, real=real, faults=faults: (dataclasses.replace(real[0], fault=next(faults)), real[1]),
+        )  # fmt: skip
+        found = [text for text in judge(*tuned, scenario, placed_step).violations if "harmless" in text]
+        assert len(found) == wrong
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,10 @@ class ChosenGains:
     def missed_by(self, one: Judged) -> dict[str, float]:
         return self.goals.missed(one)
 
+    def allows(self, one: Judged) -> bool:
+        """Whether it could have been chosen: every goal is met, and the observer is no quicker than the law bears."""
+        return not self.missed_by(one) and LAWS[self.law].beyond(one.settings) == 0.0
+
     def with_gains(self, one: Judged) -> Control:
         """[control] with the gains of another choice."""
         update = _changes(one.settings, LAWS[self.law])
@@ -374,8 +378,8 @@ def trade_off_figure(found: ChosenGains, title: str) -> Figure:
     with canvas(4.2, title) as figure:
         axis = figure.subplots()
         for colour, label, chosen in (
-            (GREY, "misses a goal", [one for one in stable if not _meets(one)]),
-            (BLUE, "margins met", [one for one in stable if _meets(one)]),
+            (GREY, "misses a goal", [one for one in stable if not found.allows(one)]),
+            (BLUE, "meets all goals", [one for one in stable if found.allows(one)]),
             (ORANGE, "chosen", [found.best]),
         ):
             size = 60 if label == "chosen" else 10
@@ -391,9 +395,3 @@ def trade_off_figure(found: ChosenGains, title: str) -> Figure:
         axis.set_ylabel("modelled error / that of the chosen point")
         axis.legend()
         return figure
-
-
-def _meets(one: Judged) -> bool:
-    return (
-        one.phase_margin_deg >= PHASE_MARGIN_deg and one.gain_margin >= GAIN_MARGIN and one.sensitivity <= SENSITIVITY
-    )

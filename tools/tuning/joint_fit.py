@@ -37,7 +37,7 @@ USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its su
 LATEST_s = 0.012  # of delay and of lag, at most
 # by which a value is off besides, because sliding friction is not viscous, and hysteresis no spring: of
 # tests/bench/tune_ensemble.py
-MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.04, "resonance_Hz": 0.025}
+MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.09, "resonance_Hz": 0.05}
 MODEL_LATE_s = 1e-4
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",

@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
+from jointctl.drivers.errors import DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
-from jointctl.tools.analysis.margins import Margins, margins
-from jointctl.tools.analysis.reducer_map import FoundMap, found_map, map_figure
+from jointctl.tools.analysis.reducer_map import FoundMap, found_map
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.control_section import Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
@@ -31,12 +29,11 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.configuration.sections import Limits, ReducerMap
 from jointctl.tools.identification.friction_data import read_friction_data
-from jointctl.tools.identification.identification import Options, identify_friction
+from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
-from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
@@ -52,8 +49,8 @@ from jointctl.tools.tuning.found_values import (
     with_values,
     without_friction,
 )
-from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
-from jointctl.tools.tuning.gains import ChosenGains, choose_gains, trade_off_figure
+from jointctl.tools.tuning.frequency_response import FrequencyResponse, from_dict
+from jointctl.tools.tuning.gains import ChosenGains, choose_gains
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
 from jointctl.tools.tuning.measured_response import (
     measured_response,
@@ -63,8 +60,8 @@ from jointctl.tools.tuning.measured_response import (
 )
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
-from jointctl.tools.verbs.response import fit_table
 from jointctl.tools.verbs.sweep import Sweep
+from jointctl.tools.verbs.tune_report import write_report
 from jointctl.tools.written_file import replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
@@ -95,6 +92,7 @@ class Tune:
     state: dict[str, Any] = field(init=False, default_factory=dict)  # results by step, as JSON holds them
     fit: JointFit | None = field(init=False, default=None)
     response: FrequencyResponse | None = field(init=False, default=None)
+    found_friction: Identification | None = field(init=False, default=None)
     found_map: FoundMap | None = field(init=False, default=None)
     gains: ChosenGains | None = field(init=False, default=None)
 
@@ -130,7 +128,8 @@ class Tune:
             f"response   triangle at 0.2 rad/s within {inside}, multisine up to {task.largest_Nm:.1f} Nm, 2 minutes",
             f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
             "map        once back and forth at 0.03 rad/s, where the reducer is soft",
-            f"verify     {trajectory} of the configuration, {VERIFY_s:.0f} s, before and after",
+            f"verify     {trajectory} of the configuration, {VERIFY_s:.0f} s, with the new and the old gains; before "
+            "and after it half a minute of the response, for a joint that has changed",
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
             "keep the joint free and unloaded, a hand on the emergency stop",
         ]
@@ -247,7 +246,7 @@ class Tune:
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
         )
         # for the motions that measure: at low speed a softer law sticks, and no plateau settles
-        self.config = self._with_control(self._chosen(self.options.law, "tracking").control)
+        self.config = self._with_control(self.chosen_gains(self.options.law, "tracking").control)
 
     def _fitted(self) -> list[Found]:
         assert self.fit is not None
@@ -270,7 +269,7 @@ class Tune:
         standstill_radps = max(limits.standstill_radps, min(flip_radps, STANDSTILL_SHARE * limits.velocity_max_radps))
         return self.config.limits.model_copy(update={"standstill_radps": standstill_radps})
 
-    def _chosen(self, law: str, objective: str) -> ChosenGains:
+    def chosen_gains(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
         return choose_gains(self.config, self.fit, law, objective)
 
@@ -281,6 +280,9 @@ class Tune:
         return {**kept["gravity"], "found": kept["sure"]}
 
     def _take_gravity(self, kept: dict[str, Any]) -> None:
+        self.carrier.output.note(
+            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else "  none that can be told"
+        )
         if kept["found"]:
             self.config = with_values(self.config, self._gravity_values())
 
@@ -315,7 +317,7 @@ class Tune:
             self.carrier.drive_state = command.drive_state
         if ended:
             raise NotCarriedOut(command.drive_state, "" if control is None else control.signals.stopped_by)
-        found = identify_friction(read_friction_data(path, None), Options(swarm=SWARM))
+        found = self.found_friction = self.identified()
         static = static_friction_Nm(self.config)
         return {
             "section": section_values(found.branches["positive"], found.branches["negative"]),
@@ -323,7 +325,11 @@ class Tune:
             "seconds": command.file.elapsed_s if command.file is not None else 0.0,
         }  # fmt: skip
 
+    def identified(self) -> Identification:
+        return identify_friction(read_friction_data(self.folder / "friction.csv", None), Options(swarm=SWARM))
+
     def _take_friction(self, kept: dict[str, Any]) -> None:
+        self.carrier.output.note(f"  {kept['points']} plateaus, RMSE {1e3 * kept['rmse_Nm']:.3g} mNm at the motor")
         self.config = with_friction(self.config, kept["section"])
 
     # --- 5. map of the reducer ---
@@ -341,6 +347,7 @@ class Tune:
         return self.found_map.values(encoder.direction, encoder.zero_counts)
 
     def _take_map(self, kept: dict[str, Any]) -> None:
+        self.carrier.output.note("  measured" if kept else "  none: it is for a soft reducer with two encoders")
         if kept and self.config.reducer is not None:
             values: dict[str, Any] = {
                 key: tuple(value) if isinstance(value, list) else value for key, value in kept.items()
@@ -352,7 +359,7 @@ class Tune:
 
     def _step_gains(self) -> dict[str, Any]:
         self._require_same_joint("before the gains")  # a law that is chosen for another joint may swing
-        self.gains = self._chosen(self.options.law, self.options.objective)
+        self.gains = self.chosen_gains(self.options.law, self.options.objective)
         self._require(self.gains)
         return self._kept(self.gains)
 
@@ -384,6 +391,11 @@ class Tune:
 
     def _take_gains(self, kept: dict[str, Any]) -> None:
         self.config = self._with_control(Control.model_validate_json(json.dumps(kept["control"])))
+        control = self.config.control
+        self.carrier.output.note(
+            f"  law {kept['law']}, kp {control.kp:g}, kv {control.kv:g}, "
+            f"phase margin {kept['phase_margin_deg']:.1f} deg in the worst case"
+        )
         for name in kept["missed"]:
             self.carrier.output.warning(f"this joint does not allow all: {name}")
 
@@ -398,6 +410,14 @@ class Tune:
         except JointctlError as error:
             return {**found, "before_refused": error.message}
         return {**found, "before": self._verified(before, "the same before")}
+
+    def _take_verification(self, kept: dict[str, Any]) -> None:
+        shown = [
+            f"{when} {kept[when]['rmse_mrad']:.4f} mrad"
+            for when in ("before", "after")
+            if "rmse_mrad" in kept.get(when, {})
+        ]
+        self.carrier.output.note(f"  RMSE {', '.join(shown)}")
 
     def _before(self) -> Config:
         """The configuration as it was, on the joint that was found."""
@@ -433,7 +453,7 @@ class Tune:
 
     def _refine(self) -> None:
         """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
-        gains = self.gains or self._chosen(self.options.law, self.options.objective)
+        gains = self.gains or self.chosen_gains(self.options.law, self.options.objective)
         error = self.state["verification"]["after"]["rmse_mrad"]
         allowed = [one for one in gains.tried if one.stable and not gains.missed_by(one)]
         tried, runs = [gains.best], list[dict[str, Any]]()
@@ -513,61 +533,8 @@ class Tune:
         replace_file(self.folder / "before.toml", text.encode())
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
-        self._report()
+        write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
-
-    def _tables(self) -> tuple[Table, Table]:
-        assert self.fit is not None
-        assert self.response is not None
-        gains, verified = self.state["gains"], self.state["verification"]
-        table = Table(
-            "", *(Column(name, justify="right") for name in ("before", "after")), title="Loop and tracking",
-            title_justify="left", caption_justify="left",
-            caption="margins of the joint that was found, worst case; error from 5 s on, as the encoder shows it",
-        )  # fmt: skip
-        both = [_margins_or_none(config) for config in (self._before_on_found(), self.config)]
-        for name, key, form in (
-            ("phase margin [deg]", "phase_margin_deg", ".1f"), ("gain margin up", "gain_margin_up", ".2f"),
-            ("largest |S|", "sensitivity_peak", ".2f"),
-        ):  # fmt: skip
-            table.add_row(name, *("-" if one is None else format(getattr(one, key), form) for one in both))
-        before, after = verified.get("before", {}), verified["after"]
-        for name, key in (("RMSE [mrad]", "rmse_mrad"), ("peak [mrad]", "peak_mrad"), ("chatter [Nm]", "chatter_Nm")):
-            shown = [f"{one[key]:.4g}" if key in one else one.get("fault", "refused") for one in (before, after)]
-            table.add_row(name, *shown)
-        for name in gains["missed"]:
-            table.add_row("missed", "", name)
-        return fit_table(self.original, self.response, self.fit), table
-
-    def _before_on_found(self) -> Config:
-        return self.config.model_copy(
-            update={"control": self.original.control, "joint_encoder": self.original.joint_encoder}
-        )
-
-    def _report(self) -> None:
-        fitted, loop = self._tables()
-        output = self.carrier.output
-        data = {**self.state, "values": [[".".join(one.section), one.key, one.value] for one in self._values()]}
-        output.result(fitted)
-        output.result(loop, data)
-        assert self.response is not None
-        gains = self.gains or self._chosen(self.options.law, self.options.objective)
-        pictures: list[Any] = [
-            svg_figure(bode_figure(self.response, "Frequency response", self.fit), "Bode plot with coherence"),
-            svg_figure(trade_off_figure(gains, "Error against margin"), "Every choice of gains that was tried"),
-        ]
-        if self.found_map is not None:
-            pictures.append(svg_figure(map_figure(self.found_map, "Map of the reducer"), "Kinematic error and ripple"))
-        friction = self.state["friction"]
-        moved = [Paragraph(line) for line in self.envelope()]
-        sections = [
-            Section("Moved", moved), Section("Found", [from_terminal(fitted)]),
-            Section("Friction", [Paragraph(
-                f"{friction['points']} plateaus, RMSE {friction['rmse_Nm']:.3g} Nm at the motor, in friction.csv"
-            )]),
-            Section("Loop and tracking", [from_terminal(loop)]), Section("Figures", pictures),
-        ]  # fmt: skip
-        write_verb_page(self.folder / "report.html", f"Tune of {self.original.path.stem}", sections, output)
 
 
 def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
@@ -582,13 +549,6 @@ def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
 
 def _require_valid(path: Path) -> None:
     load_config(path)
-
-
-def _margins_or_none(config: Config) -> Margins | None:
-    try:
-        return margins(loop_settings(config)[0])
-    except ConfigurationError:
-        return None
 
 
 def _apart(one: Any, other: Any) -> float:

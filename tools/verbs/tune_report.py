@@ -1,0 +1,105 @@
+"""What a tune leaves for its user: the tables of the terminal, and the report of one page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Column, Table
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.margins import Margins, margins
+from jointctl.tools.analysis.reducer_map import map_figure
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.identification.identification_report import fit_figure
+from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
+from jointctl.tools.recording.report_page import Table as PageTable
+from jointctl.tools.tuning.frequency_response import bode_figure
+from jointctl.tools.tuning.gains import trade_off_figure
+from jointctl.tools.verbs.response import fit_table
+
+if TYPE_CHECKING:
+    from jointctl.tools.verbs.tune_steps import Tune
+
+GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz")  # that are shown
+
+
+def _tables(job: Tune) -> tuple[Table, Table]:
+    """What was found, and loop and tracking before and after."""
+    assert job.fit is not None
+    assert job.response is not None
+    gains, verified = job.state["gains"], job.state["verification"]
+    table = Table(
+        "", *(Column(name, justify="right") for name in ("before", "after")), title="Loop and tracking",
+        title_justify="left", caption_justify="left",
+        caption="margins of the joint that was found, worst case; error from 5 s on, as the encoder shows it",
+    )  # fmt: skip
+    both = [_margins_or_none(config) for config in (_before_on_found(job), job.config)]
+    for name, key, form in (
+        ("phase margin [deg]", "phase_margin_deg", ".1f"), ("gain margin up", "gain_margin_up", ".2f"),
+        ("largest |S|", "sensitivity_peak", ".2f"),
+    ):  # fmt: skip
+        table.add_row(name, *("-" if one is None else format(getattr(one, key), form) for one in both))
+    before, after = verified.get("before", {}), verified["after"]
+    for name, key in (("RMSE [mrad]", "rmse_mrad"), ("peak [mrad]", "peak_mrad"), ("chatter [Nm]", "chatter_Nm")):
+        shown = [f"{one[key]:.4g}" if key in one else one.get("fault", "refused") for one in (before, after)]
+        table.add_row(name, *shown)
+    for key in GAINS:
+        pair = [getattr(config.control, key) for config in (job.original, job.config)]
+        if any(pair):
+            table.add_row(key, *(f"{value:g}" for value in pair))
+    for name in gains["missed"]:
+        table.add_row("missed", "", name)
+    return fit_table(job.original, job.response, job.fit), table
+
+
+def _before_on_found(job: Tune) -> Config:
+    return job.config.model_copy(update={"control": job.original.control, "joint_encoder": job.original.joint_encoder})
+
+
+def write_report(job: Tune, values: list[list[Any]]) -> None:
+    """The page, and the tables on the terminal; `values` are those that the file got."""
+    fitted, loop = _tables(job)
+    output = job.carrier.output
+    data = {**job.state, "values": values}
+    output.result(fitted)
+    output.result(loop, data)
+    assert job.response is not None
+    gains = job.gains or job.chosen_gains(job.options.law, job.options.objective)
+    measured = job.found_friction or job.identified()
+    used = {word: direction.index for word, direction in measured.directions.items()}
+    curve = fit_figure(measured.data, measured.branches, used, "Friction at the motor", identified=measured)
+    pictures: list[Any] = [
+        svg_figure(bode_figure(job.response, "Frequency response", job.fit), "Bode plot with coherence"),
+        svg_figure(curve, "Friction: plateaus and curve with its band of 95 %"),
+        svg_figure(trade_off_figure(gains, "Error against margin"), "Every choice of gains that was tried"),
+    ]
+    if job.found_map is not None:
+        pictures.append(svg_figure(map_figure(job.found_map, "Map of the reducer"), "Kinematic error and ripple"))
+    moved = [line.split(maxsplit=1) for line in job.envelope()]
+    sections = [
+        Section("Moved", [PageTable(["step", "motion"], moved)]),
+        Section("Found", [from_terminal(fitted), *_other_findings(job)]),
+        Section("Loop and tracking", [from_terminal(loop)]), Section("Figures", pictures),
+    ]  # fmt: skip
+    write_verb_page(job.folder / "report.html", f"Tune of {job.original.path.stem}", sections, output)
+
+
+def _other_findings(job: Tune) -> list[Paragraph]:
+    friction, gravity = job.state["friction"], job.state["gravity"]
+    lines = [
+        f"Friction: {friction['points']} plateaus in friction.csv, the curve misses them by "
+        f"{1e3 * friction['rmse_Nm']:.3g} mNm (RMSE) at the motor."
+    ]
+    if gravity["found"]:
+        lines.append(f"Gravity: {gravity['torque_Nm']:.3g} +- {gravity['half_Nm']:.2g} Nm.")
+    if job.state["map"]:
+        lines.append("Map of the reducer: in the figure, and in [reducer.map].")
+    return [Paragraph(line) for line in lines]
+
+
+def _margins_or_none(config: Config) -> Margins | None:
+    try:
+        return margins(loop_settings(config)[0])
+    except ConfigurationError:
+        return None
