@@ -11,6 +11,17 @@ from jointctl.firmware_py.schema import array_of, f8, i4, i8, record
 BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
 RIPPLES = 2  # sines of the motor angle that it finds
 ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
+HARMONICS = 4  # of a series of the motor angle
+
+
+@record
+class HarmonicSeries:
+    """A sum of sines of the motor angle."""
+
+    count: i4  # how many of the following are in use
+    amplitude: Annotated[np.ndarray, array_of(f8, HARMONICS)]
+    turns_prad: Annotated[np.ndarray, array_of(f8, HARMONICS)]  # order per joint turn / 2 pi
+    phase_turns: Annotated[np.ndarray, array_of(f8, HARMONICS)]
 
 
 @record
@@ -35,7 +46,7 @@ class FrictionConstants:
 
     positive: FrictionBranch
     negative: FrictionBranch
-    conditioned: i4  # whether friction depends on load or temperature: any of the following is not zero
+    conditioned: i4  # whether friction depends on load, temperature or angle: any of the following is not zero
     load_coulomb: f8  # Coulomb friction for each Nm that the reducer transmits
     load_viscous_spr: f8  # viscous friction for the same, joint rad/s
     temperature_coulomb_pK: f8
@@ -43,6 +54,7 @@ class FrictionConstants:
     reference_degC: f8  # where the curve holds as it stands
     lowest_degC: f8  # the factors are those of these temperatures beyond them
     highest_degC: f8
+    of_angle: HarmonicSeries  # share of the friction by which it is greater
 
 
 @record

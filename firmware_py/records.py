@@ -8,10 +8,12 @@ from typing import Annotated
 
 import numpy as np
 
+from jointctl.firmware_py.friction_records import HARMONICS as HARMONICS
 from jointctl.firmware_py.friction_records import AdaptationConstants as AdaptationConstants
 from jointctl.firmware_py.friction_records import AdaptationState as AdaptationState
 from jointctl.firmware_py.friction_records import FrictionBranch as FrictionBranch
 from jointctl.firmware_py.friction_records import FrictionConstants as FrictionConstants
+from jointctl.firmware_py.friction_records import HarmonicSeries as HarmonicSeries
 from jointctl.firmware_py.friction_records import LuGreConstants as LuGreConstants
 from jointctl.firmware_py.friction_records import TemperatureConstants as TemperatureConstants
 from jointctl.firmware_py.motion_records import ChangeConstants, ChangeState, Reference, TrajectoryConstants
@@ -23,7 +25,6 @@ from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
-HARMONICS = 4  # of a map of the reducer
 KNEES = 2  # of the reducer's stiffness
 
 
@@ -102,16 +103,6 @@ class LearningState:
     stopped: i4  # switched off for the rest of the run, because the error grew
     learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
     recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
-
-
-@record
-class HarmonicSeries:
-    """A sum of sines of the motor angle."""
-
-    count: i4  # how many of the following are in use
-    amplitude: Annotated[np.ndarray, array_of(f8, HARMONICS)]
-    turns_prad: Annotated[np.ndarray, array_of(f8, HARMONICS)]  # order per joint turn / 2 pi
-    phase_turns: Annotated[np.ndarray, array_of(f8, HARMONICS)]
 
 
 @record
