@@ -15,9 +15,11 @@ With a load and a temperature, C = tc + (ts - tc) exp(-u / ws) and V = the rest 
     (C + kc |tau|) exp(-bc (T - T0)) + (V + kv |tau| u) exp(-bv (T - T0))
 
 tau is the torque that the reducer transmits, T the drive's temperature.  Friction that goes with |tau| always opposes
-the motion, as in the load-dependent models of Rhoban's BAM; the exponential is that of a lubricant's viscosity.
+the motion, as in the load-dependent models of Rhoban's BAM; the exponential is that of a lubricant's viscosity.  All of
+it is times 1 + sum a_k sin(o_k theta + phi_k), theta the motor's angle / n: what tooth and wave generator do at each
+turn, with the direction of the motion.  A torque that goes with the angle alone is no friction: `[ripple]`.
 
-Not modelled: dependence on position; friction that differs between driving and being driven."""
+Not modelled: friction that differs between driving and being driven."""
 
 from __future__ import annotations
 
@@ -27,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jointctl.firmware_py.flexible_joint import value_at
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.records import FrictionBranch, FrictionConstants, LuGreConstants
 from jointctl.firmware_py.schema import new
@@ -56,7 +59,7 @@ class Condition(NamedTuple):
     """What friction depends on besides the speed."""
 
     load_Nm: float  # size of the torque that the reducer transmits, at the motor: that at the joint over the ratio
-    coulomb: float  # factors of the temperature
+    coulomb: float  # factors of temperature and angle
     viscous: float
 
 
@@ -64,14 +67,17 @@ UNLOADED = Condition(0.0, 1.0, 1.0)  # and at the temperature for which the curv
 
 
 @kernel
-def condition_of(friction: FrictionConstants, load_Nm: float, temperature_degC: float) -> Condition:
-    """`load_Nm`: the torque that the reducer transmits, at the motor; its sign does not matter."""
+def condition_of(
+    friction: FrictionConstants, load_Nm: float, temperature_degC: float, motor_rad: float = 0.0
+) -> Condition:
+    """`load_Nm`: the torque that the reducer transmits, at the motor, of any sign; `motor_rad`: its angle / n."""
     if friction.conditioned == 0:
         return Condition(0.0, 1.0, 1.0)
     warming_K = min(max(temperature_degC, friction.lowest_degC), friction.highest_degC) - friction.reference_degC
     coulomb = math.exp(-friction.temperature_coulomb_pK * warming_K)
     viscous = math.exp(-friction.temperature_viscous_pK * warming_K)
-    return Condition(abs(load_Nm), coulomb, viscous)
+    of_angle = 1.0 + value_at(friction.of_angle, motor_rad)
+    return Condition(abs(load_Nm), coulomb * of_angle, viscous * of_angle)
 
 
 @inlined

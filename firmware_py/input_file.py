@@ -18,6 +18,7 @@ from typing import IO, Any
 MIB = 1 << 20
 LARGEST_TEXT_BYTES = 16 * MIB  # of a configuration, an EDS or DCF file, a list of speeds, a sidecar
 LARGEST_TABLE_BYTES = 64 * MIB  # of a CSV table
+LARGEST_SERIES_BYTES = 512 * MIB  # of one that is only read for an identification: some million lines
 LARGEST_LOG_BYTES = 64 << 30  # of a run log, which is read piece by piece: a month at 1 kHz
 DEEPEST = 64  # sections, tables and lists in each other
 LONGEST_BITS = 1000  # of a whole number; beyond it is no float either

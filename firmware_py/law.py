@@ -362,8 +362,9 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
 
 
 @kernel
-def _condition(constants: LawConstants, state: LawState, transmitted_Nm: float) -> Condition:
-    return condition_of(constants.friction, transmitted_Nm / constants.reduction_ratio, state.temperature_degC)
+def _condition(constants: LawConstants, state: LawState, transmitted_Nm: float, motor_rad: float) -> Condition:
+    load_Nm = transmitted_Nm / constants.reduction_ratio
+    return condition_of(constants.friction, load_Nm, state.temperature_degC, motor_rad)
 
 
 @kernel
@@ -373,11 +374,15 @@ def friction_feed_forward_Nm(
     velocity_radps: float,
     desired_velocity_radps: float,
     transmitted_Nm: float = 0.0,
+    motor_rad: float = 0.0,
 ) -> float:
-    """n tau_f0 at the joint [Nm] by the configured rule; `transmitted_Nm` through the reducer by the model."""
+    """n tau_f0 at the joint [Nm] by the configured rule; `transmitted_Nm` through the reducer by the model.
+
+    `motor_rad`: desired angle of the motor / n.
+    """
     if constants.feed_forward == FeedForward.NONE:
         return 0.0
-    condition = _condition(constants, state, transmitted_Nm)
+    condition = _condition(constants, state, transmitted_Nm, motor_rad)
     if constants.feed_forward == FeedForward.LUGRE_DESIRED:
         deflection, torque = step_lugre(
             constants.lugre,
@@ -404,11 +409,11 @@ def _friction_Nm(
     """The same for the motion desired `feed_forward_lead_s` later; adapted, of the desired motor angle / n as well."""
     lead_s = constants.feed_forward_lead_s
     desired_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
+    ahead_rad = motor_rad + lead_s * reference.velocity_radps
     if constants.adaptation.enabled != 0:
-        ahead_rad = motor_rad + lead_s * reference.velocity_radps
-        condition = _condition(constants, state, transmitted_Nm)
+        condition = _condition(constants, state, transmitted_Nm, ahead_rad)
         return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps, condition)
-    return friction_feed_forward_Nm(constants, state, velocity_radps, desired_radps, transmitted_Nm)
+    return friction_feed_forward_Nm(constants, state, velocity_radps, desired_radps, transmitted_Nm, ahead_rad)
 
 
 @kernel
@@ -424,7 +429,7 @@ def _adapt(
     fed_Nm = state.friction_torque_Nm + state.learned_torque_Nm
     adapt(
         constants, state.adaptation, state.observer_torque_Nm, fed_Nm, desired_radps, position_rad,
-        desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm),
+        desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
     )  # fmt: skip
 
 

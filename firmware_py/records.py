@@ -16,6 +16,17 @@ from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
 RIPPLES = 2  # sines of the motor angle that it finds
 ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
+HARMONICS = 4  # of a series of the motor angle
+
+
+@record
+class HarmonicSeries:
+    """A sum of sines of the motor angle."""
+
+    count: i4  # how many of the following are in use
+    amplitude: Annotated[np.ndarray, array_of(f8, HARMONICS)]
+    turns_prad: Annotated[np.ndarray, array_of(f8, HARMONICS)]  # order per joint turn / 2 pi
+    phase_turns: Annotated[np.ndarray, array_of(f8, HARMONICS)]
 
 
 @record
@@ -40,7 +51,7 @@ class FrictionConstants:
 
     positive: FrictionBranch
     negative: FrictionBranch
-    conditioned: i4  # whether friction depends on load or temperature: any of the following is not zero
+    conditioned: i4  # whether friction depends on load, temperature or angle: any of the following is not zero
     load_coulomb: f8  # Coulomb friction for each Nm that the reducer transmits
     load_viscous_spr: f8  # viscous friction for the same, joint rad/s
     temperature_coulomb_pK: f8
@@ -48,6 +59,7 @@ class FrictionConstants:
     reference_degC: f8  # where the curve holds as it stands
     lowest_degC: f8  # the factors are those of these temperatures beyond them
     highest_degC: f8
+    of_angle: HarmonicSeries  # share of the friction by which it is greater
 
 
 @record
@@ -101,7 +113,6 @@ class AdaptationState:
 NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
-HARMONICS = 4  # of a map of the reducer
 KNEES = 2  # of the reducer's stiffness
 
 
@@ -180,16 +191,6 @@ class LearningState:
     stopped: i4  # switched off for the rest of the run, because the error grew
     learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
     recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
-
-
-@record
-class HarmonicSeries:
-    """A sum of sines of the motor angle."""
-
-    count: i4  # how many of the following are in use
-    amplitude: Annotated[np.ndarray, array_of(f8, HARMONICS)]
-    turns_prad: Annotated[np.ndarray, array_of(f8, HARMONICS)]  # order per joint turn / 2 pi
-    phase_turns: Annotated[np.ndarray, array_of(f8, HARMONICS)]
 
 
 @record

@@ -289,7 +289,8 @@ def _torque_on_link(joint: JointOfArm, c: PlantConstants, s: PlantState) -> None
     resisting = load + _brake_Nm(joint, c, middle, velocity)
     if c.end_stops != 0:
         resisting += end_stop_torque_Nm(c, middle, velocity)
-    condition = condition_of(c.friction, s.friction_load_Nm * c.inverse_ratio, s.motor_temperature_degC)
+    load_Nm = s.friction_load_Nm * c.inverse_ratio
+    condition = condition_of(c.friction, load_Nm, s.motor_temperature_degC, s.motor_position_rad)
     if c.flexible == 0:
         actuator = rigid_actuator_Nm(c, current, middle)
         factor = modulation(c, s, middle)

@@ -434,7 +434,8 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     if c.end_stops != 0:
         resisting += end_stop_torque_Nm(c, joint_middle, joint_velocity)
 
-    condition = condition_of(c.friction, s.friction_load_Nm * c.inverse_ratio, s.motor_temperature_degC)
+    load_Nm = s.friction_load_Nm * c.inverse_ratio
+    condition = condition_of(c.friction, load_Nm, s.motor_temperature_degC, s.motor_position_rad)
     if c.flexible == 0:
         actuator = rigid_actuator_Nm(c, current, joint_middle)
         factor = modulation(c, s, joint_middle)

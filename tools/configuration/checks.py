@@ -7,10 +7,11 @@ import math
 from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap, Trajectory
+from jointctl.tools.configuration.sections import Encoder, Friction, FrictionDirection, Reducer, ReducerMap, Trajectory
 
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
+LARGEST_SHARE = 0.9  # of the friction that may go with the angle
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -333,10 +334,11 @@ def _friction_problems(config: Config) -> list[str]:
     elif config.control.feed_forward == "lugre_desired" and friction.lugre is None:
         found.append("[friction.lugre] is missing: control.feed_forward (=lugre_desired) needs it")
     if friction is not None:
-        shape = _shape_problems("friction", friction)
+        shape = _shape_problems("friction", friction) + _angle_problems("friction", friction, config.encoder)
         found += shape or _feed_forward_problems(config, friction)
     if config.virtual is not None and config.virtual.friction is not None:
-        found += _shape_problems("virtual.friction", config.virtual.friction)
+        true = config.virtual.friction
+        found += _shape_problems("virtual.friction", true) + _angle_problems("virtual.friction", true, config.encoder)
     return found
 
 
@@ -364,6 +366,27 @@ def _feed_forward_problems(config: Config, friction: Friction) -> list[str]:
                 f"friction.{name}: the curve must oppose the motion up to limits.velocity_max_radps "
                 f"(={config.limits.velocity_max_radps:g}); at {against:.4g} {friction.velocity_unit} it does not"
             )
+    return found
+
+
+def _angle_problems(section: str, friction: Friction, encoder: Encoder) -> list[str]:
+    """[friction.angle]: as many numbers each, friction stays against the motion, and the mounting is that of then."""
+    made = friction.angle
+    if made is None:
+        return []
+    counts = [len(values) for values in (made.share, made.per_motor_turn, made.phase_rad)]
+    found = []
+    if len(set(counts)) > 1:
+        given = ", ".join(map(str, counts))
+        found.append(f"{section}.angle.share, per_motor_turn and phase_rad (={given}) must be equally many numbers")
+    if not sum(map(abs, made.share)) <= LARGEST_SHARE:
+        found.append(f"{section}.angle.share (={list(made.share)}) must add up to {LARGEST_SHARE:g} at most, unsigned")
+    found += [
+        f"{section}.angle.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
+        "it was identified with another mounting"
+        for key in ("direction", "zero_counts")
+        if getattr(made, key) not in (None, getattr(encoder, key))
+    ]
     return found
 
 

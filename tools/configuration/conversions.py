@@ -79,23 +79,31 @@ def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
         return friction_model.branch_constants(printed, negative=negative, radps_per_unit=speed, torque_scale=scale)
 
     constants = friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))
-    _fill_condition(constants[0], friction)
+    _fill_condition(constants[0], friction, reduction_ratio)
     return constants
 
 
-def _fill_condition(record: Any, friction: Friction) -> None:
-    load, warm = friction.load, friction.temperature
+def _fill_condition(record: Any, friction: Friction, reduction_ratio: float) -> None:
+    load, warm, angle = friction.load, friction.temperature, friction.angle
     if load is not None:
         record.load_coulomb, record.load_viscous_spr = load.coulomb, load.viscous_spr
     if warm is not None:
         record.temperature_coulomb_pK, record.temperature_viscous_pK = warm.coulomb_pK, warm.viscous_pK
         record.reference_degC = warm.reference_degC
         record.lowest_degC, record.highest_degC = held_beyond_degC(warm)
-    record.conditioned = int(
-        any(
-            (record.load_coulomb, record.load_viscous_spr, record.temperature_coulomb_pK, record.temperature_viscous_pK)
-        )
-    )
+    if angle is not None:
+        fill_series(record.of_angle, reduction_ratio, (angle.share, angle.per_motor_turn, angle.phase_rad))
+    warming = record.temperature_coulomb_pK, record.temperature_viscous_pK
+    record.conditioned = int(any((record.load_coulomb, record.load_viscous_spr, *warming, record.of_angle.count)))
+
+
+def fill_series(series: Any, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
+    """A `HarmonicSeries`; `waves`: amplitudes, periods a motor turn, phases [rad]."""
+    series.count = len(waves[0])
+    for i, (amplitude, per_motor_turn, phase_rad) in enumerate(zip(*waves, strict=True)):
+        series.amplitude[i] = amplitude
+        series.turns_prad[i] = ratio * per_motor_turn / math.tau
+        series.phase_turns[i] = phase_rad / math.tau
 
 
 def held_beyond_degC(warm: FrictionTemperature) -> tuple[float, float]:
@@ -121,4 +129,6 @@ def static_friction_Nm(config: Config) -> float | None:
         warm = friction.temperature
         ends = held_beyond_degC(warm)
         static_Nm *= max(math.exp(-warm.coulomb_pK * (end - warm.reference_degC)) for end in ends)
+    if friction.angle is not None:
+        static_Nm *= 1.0 + sum(map(abs, friction.angle.share))
     return static_Nm

@@ -18,7 +18,6 @@ from jointctl.firmware_py.records import (
     AdaptationConstants,
     AxisConstants,
     FlexibleConstants,
-    HarmonicSeries,
     LawConstants,
     LimitConstants,
     SequenceConstants,
@@ -41,6 +40,7 @@ from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.control_section import Adaptation, Control
 from jointctl.tools.configuration.conversions import (
+    fill_series,
     friction_constants,
     law_resolution_rad,
     period_s,
@@ -182,7 +182,7 @@ def _fill_law(law: LawConstants, config: Config) -> None:
     ripple = config.ripple
     if ripple is not None:
         series = law.flexible.torque_ripple
-        _fill_series(series, joint.reduction_ratio, (ripple.torque_Nm, ripple.per_motor_turn, ripple.phase_rad))
+        fill_series(series, joint.reduction_ratio, (ripple.torque_Nm, ripple.per_motor_turn, ripple.phase_rad))
     network = law.network
     _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.lyapunov_q[0], control.lyapunov_q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
@@ -225,16 +225,7 @@ def _fill_flexible(record: FlexibleConstants, config: Config, reducer: Reducer) 
     if reducer.map is not None:
         for name, unit in (("kinematic_error", "rad"), ("torque_ripple", "Nm")):
             made = tuple(getattr(reducer.map, f"{name}_{rest}") for rest in (unit, "per_motor_turn", "phase_rad"))
-            _fill_series(getattr(record, name), ratio, made)
-
-
-def _fill_series(series: HarmonicSeries, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
-    """`waves`: amplitudes, periods a motor turn, phases [rad]."""
-    series.count = len(waves[0])
-    for i, (amplitude, per_motor_turn, phase_rad) in enumerate(zip(*waves, strict=True)):
-        series.amplitude[i] = amplitude
-        series.turns_prad[i] = ratio * per_motor_turn / math.tau
-        series.phase_turns[i] = phase_rad / math.tau
+            fill_series(getattr(record, name), ratio, made)
 
 
 def _fill_velocity(record: VelocityConstants, config: Config, cutoff_Hz: float) -> None:

@@ -247,6 +247,29 @@ class FrictionTemperature(Section):
     highest_degC: Annotated[float, between(-50.0, 200.0)] | None = None  # held above; none: reference + 40
 
 
+NUMBERS_TEXT = "a list of up to 4 numbers"
+
+
+def _list(value: object) -> tuple[float, ...]:
+    """Lists of TOML as tuples, which a frozen model needs."""
+    if isinstance(value, (list, tuple)) and len(value) <= 4 and all(is_number(x) for x in value):
+        return tuple(float(x) for x in value)
+    raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
+
+
+class FrictionAngle(Section):
+    """Friction times 1 + a sum of sines of the motor's angle, with the direction of the motion; see `identify`."""
+
+    share: Numbers  # amplitudes, four at most, together at most 0.9
+    per_motor_turn: Numbers  # periods of each; those of a joint turn divided by the ratio
+    phase_rad: Numbers  # of each, at joint angle 0
+    direction: Direction | None = None  # encoder.direction when it was measured; none = not checked
+    zero_counts: Annotated[int, between(-(2**31), 2**31 - 1)] | None = None  # encoder.zero_counts, likewise
+
+
 class Friction(Section):
     velocity_unit: Literal["deg/s", "rad/s", "r/min"]  # of ws, tv, a0..a3, knee and max
     velocity_side: Literal["joint", "motor"]  # of the velocity
@@ -256,6 +279,7 @@ class Friction(Section):
     lugre: LuGre | None = None
     load: FrictionLoad | None = None
     temperature: FrictionTemperature | None = None
+    angle: FrictionAngle | None = None
 
 
 class Margin(Section):
@@ -340,19 +364,6 @@ class JointEncoder(Section):
     stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = (
         None  # of the reducer between them: torque / stiffness is allowed in addition
     )
-
-
-NUMBERS_TEXT = "a list of up to 4 numbers"
-
-
-def _list(value: object) -> tuple[float, ...]:
-    """Lists of TOML as tuples, which a frozen model needs."""
-    if isinstance(value, (list, tuple)) and len(value) <= 4 and all(is_number(x) for x in value):
-        return tuple(float(x) for x in value)
-    raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
-
-
-Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
 
 
 # --- [reducer]: of a joint that is not rigid ---

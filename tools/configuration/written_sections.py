@@ -21,7 +21,7 @@ from jointctl.tools.written_file import replace_file
 MARK = "# identified by jointctl: "
 _WORDS = ("velocity_unit", "velocity_side", "torque_side")
 _BRANCHES = ("positive", "negative")
-_OPTIONAL = ("load", "temperature")  # sections of [friction] that only a motion identifies
+_OPTIONAL = ("load", "temperature", "angle")  # sections of [friction] that only a motion identifies
 
 
 def document_of(text: str, mark: str = MARK) -> tuple[tomlkit.TOMLDocument, str]:

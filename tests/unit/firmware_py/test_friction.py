@@ -26,6 +26,7 @@ from jointctl.firmware_py.friction import (
 from jointctl.firmware_py.records import LuGreConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ZeroSpeedRule
+from jointctl.tools.configuration.conversions import fill_series
 
 # --- The multi-stage friction model (11) with Table 3 ---
 JUST = 1e-9
@@ -243,6 +244,18 @@ def test_beyond_the_range_of_temperatures_the_factors_are_held():
     assert condition_of(friction, 0.0, 4000.0) == condition_of(friction, 0.0, 60.0)
     assert condition_of(friction, 0.0, -273.0) == condition_of(friction, 0.0, 0.0)
     assert condition_of(friction, 0.0, 59.0) != condition_of(friction, 0.0, 60.0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_friction_that_goes_with_the_angle_turns_round_with_the_motion(sign):
+    friction = conditioned()
+    fill_series(friction.of_angle, 100.0, ((0.2, 0.1), (2.0, 0.01), (0.7, -0.3)))
+    for motor_rad in (0.0, 0.123, -2.5):
+        share = 0.2 * math.sin(200.0 * motor_rad + 0.7) + 0.1 * math.sin(motor_rad - 0.3)
+        condition = condition_of(friction, 0.0, 25.0, motor_rad)
+        for v in SPEEDS_radps:
+            plain = friction_motor_torque_Nm(friction, sign * v)
+            assert friction_motor_torque_Nm(friction, sign * v, condition) == pytest.approx(plain * (1.0 + share))
 
 
 def test_the_steady_lugre_torque_has_load_and_temperature():
