@@ -126,7 +126,6 @@ class BusLock:
         try:
             self._refuse_others()
             self.marker_fd = os.memfd_create(self._name)
-            no_longer_starting()
         except BaseException:
             self.close()
             raise

@@ -149,8 +149,9 @@ class DriveGroup:
     earlier run has left enabled.  None takes part in the cyclic exchange before all were verified.
     """
 
-    def __init__(self, drives: Sequence[Drive]) -> None:
-        self.drives = tuple(drives)
+    def __init__(self, drives: Sequence[Drive], buses: Sequence[int] = ()) -> None:
+        """`buses`: of each drive the number of the first one on the same bus; none: all are on one."""
+        self.drives, self._buses = tuple(drives), buses
         self._parts = [d for d in drives if isinstance(d, DriveOfArm)] if len(drives) > 1 else []
 
     def commission(self, approve: Approval | None = None) -> list[CommissioningReport]:
@@ -168,7 +169,10 @@ class DriveGroup:
 
     def port(self) -> Any:
         """The record arrays of all as one."""
-        return np.concatenate([drive.port() for drive in self.drives]).view(np.recarray)
+        ports = np.concatenate([drive.port() for drive in self.drives]).view(np.recarray)
+        if len(set(self._buses)) > 1:
+            ports.bus[:] = self._buses
+        return ports
 
     def make_safe(self, *, asked: bool = False) -> list[str]:
         """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer."""

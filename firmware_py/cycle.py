@@ -56,11 +56,12 @@ SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
 
 
 class Histogram(IntEnum):
-    """Row of the histogram array int64[3, HISTOGRAM_BINS]."""
+    """Row of the histogram array int64[4, HISTOGRAM_BINS]."""
 
     WAKE = 0
     ROUND_TRIP = 1
     WORK = 2
+    SYNC_SPREAD = 3  # from the first bus's SYNC to the last one's, of an arm on several buses
 
 
 @kernel
@@ -118,7 +119,7 @@ class CycleMemory(NamedTuple):
     command: np.ndarray  # Command
     words: np.ndarray  # int64[WORDS]
     ring: np.ndarray  # LogRecord[R]; record k is at k % R once HEAD > k
-    histograms: np.ndarray  # int64[3, HISTOGRAM_BINS]
+    histograms: np.ndarray  # int64[4, HISTOGRAM_BINS]
     timespec: np.ndarray  # int64[2]: scratch of the clock
     arm: Arm = no_arm()  # that the axes are the joints of, in their order
 
@@ -232,9 +233,10 @@ def log_cycle(memory: CycleMemory, slot: Slot, waited_ns: int, end_ns: int) -> b
     words, ring, histograms = memory.words, memory.ring, memory.histograms
     head = load_word(words, Word.HEAD)
     work_ns = end_ns - slot.wake_ns - waited_ns
-    finished = True
+    finished, sync_spread_ns = True, 0
     for axis in range(len(memory.state)):
         state, sample = memory.state[axis], memory.sample[axis]
+        sync_spread_ns = max(sync_spread_ns, sample.sync_late_ns)
         fresh = state.sample_age_cycles == 0
         round_trip_ns = waited_ns
         if 0 < sample.time_ns <= slot.wake_ns:
@@ -252,6 +254,8 @@ def log_cycle(memory: CycleMemory, slot: Slot, waited_ns: int, end_ns: int) -> b
         finished = finished and state.phase == AxisPhase.FINISHED
     count(histograms, Histogram.WAKE, slot.late_ns)
     count(histograms, Histogram.WORK, work_ns)
+    if sync_spread_ns > 0:
+        count(histograms, Histogram.SYNC_SPREAD, sync_spread_ns)
     store_word(words, Word.SKIPPED, load_word(words, Word.SKIPPED) + slot.elapsed_cycles - 1)
     store_word(words, Word.HEAD, head + len(memory.state))
     store_word(words, Word.LOOP_NS, end_ns)
@@ -273,7 +277,8 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
         state, sample = memory.state[axis], samples[axis]
         state.slot_ns = slot.deadline_ns
         # a sample that answers an earlier SYNC belongs to no slot that could be named
-        state.sample_late_s = (slot.wake_ns - slot.deadline_ns) * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
+        late_ns = slot.wake_ns - slot.deadline_ns + sample.sync_late_ns
+        state.sample_late_s = late_ns * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
         if slept_ns > SUSPENDED_MIN_NS:
             check_suspension(state, slept_ns * 1e-9)
         sense_axis(

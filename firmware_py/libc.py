@@ -62,7 +62,7 @@ EAGAIN = errno_codes.EAGAIN
 EINTR = errno_codes.EINTR
 ENOBUFS = errno_codes.ENOBUFS
 NANOSECONDS = 1_000_000_000
-WAIT_SCRATCH_WORDS = 3  # of `wait_readable_ns`
+WAIT_SCRATCH_WORDS = 3  # of `wait_readable_ns`, and of `wait_watched_ns` for one descriptor
 
 
 if JIT_DISABLED:
@@ -159,12 +159,25 @@ def wait_readable_ns(fd: int, timeout_ns: int, scratch: np.ndarray) -> bool:
     compares its own clock.  `scratch` is int64[WAIT_SCRATCH_WORDS] owned by the caller: `struct pollfd`, packed as on
     little-endian machines, and `struct timespec`.
     """
+    watch(fd, 0, scratch)
+    return wait_watched_ns(1, timeout_ns, scratch)
+
+
+@kernel
+def watch(fd: int, number: int, scratch: np.ndarray) -> None:
+    """`fd` is one of those that `wait_watched_ns` waits for, `number` counts them from 0."""
+    scratch[number] = (POLLIN << 32) | np.int64(fd)
+
+
+@kernel
+def wait_watched_ns(count: int, timeout_ns: int, scratch: np.ndarray) -> bool:
+    """`wait_readable_ns` for the first `count` descriptors that are watched; `scratch` has two words more."""
     limited_ns = max(timeout_ns, 0)
-    scratch[0] = (POLLIN << 32) | np.int64(fd)
-    scratch[1] = limited_ns // NANOSECONDS
-    scratch[2] = limited_ns % NANOSECONDS
+    scratch[count] = limited_ns // NANOSECONDS
+    scratch[count + 1] = limited_ns % NANOSECONDS
     address = scratch.ctypes.data
-    return bool(ppoll(np.uintp(address), np.uintp(1), np.uintp(address + 8), np.uintp(0)) > 0)
+    timeout = np.uintp(address + 8 * count)
+    return bool(ppoll(np.uintp(address), np.uintp(count), timeout, np.uintp(0)) > 0)
 
 
 @kernel

@@ -460,6 +460,7 @@ class Sample:
     restarts: i4  # boot-ups of the drive seen since it was commissioned
     bus_errors: i4  # sends that failed in a row; LINE_GONE where nothing will ever be heard or said again
     heartbeat_age_cycles: i4  # since the drive's own last heartbeat; 0 where it sends none
+    sync_late_ns: i4  # how long after the first bus of an arm this drive's bus got its SYNC
 
 
 @record

@@ -7,7 +7,8 @@ make up for it among themselves; the controller's programs send and receive plai
   plant follow the bus a little behind, so that a frame that comes late still finds the plant at its time.
 * An answer cannot be brought back in the same way: between the cycles, or in front of the next answer, it would pass
   for a younger sample, and a joint at speed would seem to leap.  The drive marks its TPDOs with the stamp of their
-  SYNC, and the hub leaves one out whose SYNC is over.  What a busy computer holds up is a lost sample.
+  SYNC, and the hub leaves one out whose SYNC is over, also where it was held up itself while the frame was on the wire.
+  What a busy computer holds up is a lost sample.
 """
 
 from __future__ import annotations
@@ -84,6 +85,17 @@ def over(watch: SyncWatch, stamp_us: int, now_ns: int) -> bool:
         return True
     age_us = (now_ns // 1000 - stamp_us) & _STAMP_MASK
     return bool(age_us > max(watch.period_us // 2, SHORTEST_WINDOW_US))
+
+
+@kernel
+def outlived(watch: SyncWatch, frame: np.ndarray, sender: int, now_ns: int) -> bool:
+    """Whether this is an answer that comes out of the wire a whole period after its SYNC: the hub was held up."""
+    stamp_us = stamp_of(frame)
+    identifier = np.int64(frame[0]) | np.int64(frame[1]) << 8 | np.int64(frame[2]) << 16 | np.int64(frame[3]) << 24
+    if stamp_us == 0 or sender == watch.sender or not FIRST_TPDO <= identifier <= LAST_PDO:
+        return False
+    age_us = (now_ns // 1000 - stamp_us) & _STAMP_MASK
+    return bool(age_us > max(watch.period_us, SHORTEST_WINDOW_US))
 
 
 @kernel

@@ -71,11 +71,14 @@ class Codec(NamedTuple):
     frame_bytes: np.ndarray
 
 
+ONE_BUS = np.zeros(64, np.int64)
+
+
 class World(NamedTuple):
     """The virtual drives, operational, with their joints and the wires to them; arrays of one record an axis.
 
-    Faults are those of one axis: its wire, drive and plant.  What is the computer's (clock, processor, supervisor, the
-    adapter that is off the bus) is all axes' at once.
+    Faults are those of one axis: its wire, drive and plant.  What is the computer's (clock, processor, supervisor) is
+    all axes' at once, an adapter that is off the bus that of all axes on its bus.
     """
 
     device: np.ndarray
@@ -86,6 +89,7 @@ class World(NamedTuple):
     fault_memory: np.ndarray
     arm: ArmPlant = no_arm_plant()  # through which the joints move one another
     faulty: int = 0  # the axis that has the faults
+    bus: np.ndarray = ONE_BUS  # int64[axes or more]: of each axis the first one on the same bus
 
 
 class Scenario(NamedTuple):
@@ -141,6 +145,14 @@ def _perfect_measurement(state: AxisState, sample: Sample, plant: PlantState, pe
 
 
 @inlined
+def _is_off_bus(link: _Link, axis: int) -> bool:
+    """Whether the adapter of this axis' bus is off it."""
+    world = link.world
+    off = len(world.faults) > 0 and link.memory.timespec[_OFF_BUS] != 0
+    return off and world.bus[axis] == world.bus[world.faulty]
+
+
+@inlined
 def _to_drive(link: _Link, axis: int, slot: int, sample: Sample) -> None:
     """One frame of the controller; its answers are in the queue of the drive, with faults in that of the wire."""
     world, now_ns = link.world, link.memory.timespec[_NOW_NS]
@@ -148,8 +160,7 @@ def _to_drive(link: _Link, axis: int, slot: int, sample: Sample) -> None:
         world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
     )  # fmt: skip
     frame = link.codec.frame_bytes[slot]
-    faulty = len(world.faults) > 0
-    off_bus = faulty and link.memory.timespec[_OFF_BUS] != 0
+    faulty, off_bus = len(world.faults) > 0, _is_off_bus(link, axis)
     if faulty:
         sample.bus_errors = sample.bus_errors + 1 if off_bus else 0
     if faulty and axis == world.faulty:
@@ -178,7 +189,7 @@ def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> in
         for slot in range(count):
             _to_drive(link, axis, slot, samples[axis])
         faulty = len(world.faults) > 0
-        if link.scenario.lost_from_drive or (faulty and link.memory.timespec[_OFF_BUS] != 0):
+        if link.scenario.lost_from_drive or _is_off_bus(link, axis):
             world.queue[axis].count = 0
         if faulty and axis == world.faulty:
             _empty_mailbox(world.fault_memory[0].to_controller, codec, axis, samples, now_ns + _ANSWER_NS)

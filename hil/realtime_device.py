@@ -1,9 +1,11 @@
 """The virtual drives of a bus in real time, on a descriptor that carries 16-byte frames (AF_CAN, AF_UNIX SEQPACKET).
 
-One compiled loop without the interpreter lock, in one thread, for all drives of an arm: their joints move on together.
+One compiled loop without the interpreter lock, in one thread, for all drives of an arm, on whatever bus: their joints
+move on together.
 SDO requests go through a socket pair to a second, Python thread, and its responses come back the same way: the core
 first acts on what was written, then sends the response, so that a master which has its answer finds the controlword
-carried out.  The loop is the only sender on the bus.
+carried out.  The loop is the only sender on the bus.  On that way the first spare byte of a frame is the number of the
+first drive on its bus: drives of two buses may have the same node.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ WORDS = 3
 
 _LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
 _SDO_LOOK_S = 0.1
-_FRAMES_AT_ONCE = 64  # received before timers are looked at again
+_FRAMES_AT_ONCE = 64  # received from a bus before timers are looked at again
+_BUS_BYTE = 5  # of a frame between the core and the Python thread
+_GONE = -1  # in the place of a descriptor
 
 
 class DeviceMemory(NamedTuple):
@@ -71,9 +75,11 @@ class DeviceMemory(NamedTuple):
     arm: ArmPlant  # through which the joints of several drives move one another
     faults: Any  # FaultConstants[N, M], see `hil.faults`; None = none, and nothing of them is compiled
     fault_memories: Any  # FaultMemory[N]
+    bus: np.ndarray  # int64[N]: of each drive the first one on the same bus
+    fds: np.ndarray  # int64[N]: of the bus, where the drive is the first one on it
     words: np.ndarray  # int64[WORDS]
     frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch
-    polls: np.ndarray  # int32[4]
+    polls: np.ndarray  # int32[2 N + 2]
     timespec: np.ndarray  # int64[2]
 
 
@@ -85,6 +91,7 @@ class _Joint(NamedTuple):
     plant_s: Any  # PlantState
     queue: Any  # FrameQueue
     service_fd: int
+    bus: int  # number of the first drive on the same bus
 
 
 @kernel
@@ -99,10 +106,10 @@ def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
 
 
 @kernel
-def _flush_all(fd: int, faults: Any, now_ns: int, of: DeviceMemory) -> None:
+def _flush_all(faults: Any, now_ns: int, of: DeviceMemory) -> None:
     """As `_flush` for every drive, through the faults of its wire; late frames go out when they are due."""
     for index in range(len(of.devices)):
-        queue = of.queues[index]
+        queue, fd = of.queues[index], of.fds[of.bus[index]]
         if faults is None:
             _flush(fd, queue, of.words)
         else:
@@ -143,6 +150,7 @@ def _take_frame(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
         return
     advance(device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
     if to_encoder or (device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP):
+        frame[_BUS_BYTE] = joint.bus
         address = np.uintp(frame.ctypes.data)
         send(np.int32(joint.service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
 
@@ -156,15 +164,20 @@ def _take_frames(joint: _Joint, ready: FrameQueue, now_ns: int) -> None:
 
 
 @kernel
-def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, timespec: np.ndarray) -> None:
-    """Sleep until a frame of the bus or an SDO answer waits, `wait_ns` at most; scratch as in `DeviceMemory`."""
-    polls[0] = fd
+def _wait_for_frames(of: DeviceMemory, service_fd: int, wait_ns: int) -> None:
+    """Sleep until a frame of a bus or an SDO answer waits, `wait_ns` at most."""
+    polls, timespec = of.polls, of.timespec
+    polls[0] = service_fd
     polls[1] = POLLIN
-    polls[2] = service_fd
-    polls[3] = POLLIN
+    count = 1
+    for bus in range(len(of.devices)):
+        if of.bus[bus] == bus:
+            polls[2 * count] = of.fds[bus]  # a negative one is ignored
+            polls[2 * count + 1] = POLLIN
+            count += 1
     timespec[0] = 0
     timespec[1] = wait_ns
-    ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+    ppoll(np.uintp(polls.ctypes.data), np.uintp(count), np.uintp(timespec.ctypes.data), np.uintp(0))
 
 
 @kernel
@@ -180,31 +193,34 @@ def _let_faults_act(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int)
     for index in range(len(of.devices)):
         memory = of.fault_memories[index]
         joint = _Joint(
-            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
-        )
+            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd,
+            of.bus[index],
+        )  # fmt: skip
         step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
         take_due(memory, True, now_ns, False, memory.ready)
         _take_frames(joint, memory.ready, now_ns)
 
 
 @kernel
-def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) -> bool:
+def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, bus: int, now_ns: int) -> bool:
     """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
     frame = of.frame
     sent_ns = sent_ns_of(frame, now_ns)
     if faults is not None:
         for index in range(len(of.devices)):
-            memory = of.fault_memories[index]
-            joint = _Joint(
-                of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
-            )
-            step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
+            step_faults(
+                faults[index], of.fault_memories[index], of.devices[index], of.plant_constants[index],
+                of.plant_states[index], sent_ns,
+            )  # fmt: skip
     if len(of.devices) > 1:  # a single joint moves on when it takes the frame
         _advance_all(of, sent_ns)
-    for index in range(len(of.devices)):
+    for index in range(bus, len(of.devices)):
+        if of.bus[index] != bus:
+            continue
         joint = _Joint(
-            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
-        )
+            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd,
+            of.bus[index],
+        )  # fmt: skip
         if faults is None:
             _take_frame(joint, frame, sent_ns)
         else:
@@ -220,10 +236,12 @@ def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) 
 def _take_sdo_answer(of: DeviceMemory, now_ns: int) -> None:
     """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
     frame = of.frame
+    bus = int64(frame[_BUS_BYTE])
+    frame[_BUS_BYTE] = 0
     node_id = (int64(frame[0]) | int64(frame[1]) << 8) - 0x580
-    for index in range(len(of.devices)):
+    for index in range(bus, len(of.devices)):
         device = of.devices[index]
-        if node_id == device.node_id or node_id == device.encoder.node_id:
+        if of.bus[index] == bus and (node_id == device.node_id or node_id == device.encoder.node_id):
             device.next_due_ns = 0
             _advance_all(of, now_ns)
             append_frame(of.queues[index], frame)
@@ -238,8 +256,17 @@ def _next_due_ns(devices: np.ndarray) -> int:
 
 
 @kernel
-def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
-    """Serve the bus until the stop word; returns the value of ENDED_WORD."""
+def _all_gone(of: DeviceMemory) -> bool:
+    """Whether no bus is left."""
+    for bus in range(len(of.devices)):
+        if of.bus[bus] == bus and of.fds[bus] != _GONE:
+            return False
+    return True
+
+
+@kernel
+def run_device(service_fd: int, of: DeviceMemory) -> int:
+    """Serve the buses until the stop word; returns the value of ENDED_WORD."""
     faults, words, frame, timespec = of.faults, of.words, of.frame, of.timespec
     stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
     ended = 1
@@ -248,29 +275,36 @@ def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
         lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
         _let_faults_act(of, faults, service_fd, now_ns - lag_ns)
         wait_ns = max(0, min(_next_due_ns(of.devices) + lag_ns - now_ns, _LONGEST_WAIT_NS))
-        _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
+        _wait_for_frames(of, service_fd, wait_ns)
         woken_ns = monotonic_ns(timespec)
         drained = False
         for _ in range(_FRAMES_AT_ONCE):
-            got = _receive(fd, frame)
-            if got <= 0:
-                drained = True
-                if got < 0:
-                    ended = 2
+            if drained:
                 break
-            if got != FRAME_SIZE:
-                continue
-            now_ns = monotonic_ns(timespec)
-            if _take_from_bus(of, faults, service_fd, now_ns):
-                stamped_ns = now_ns
-            _flush_all(fd, faults, now_ns, of)
+            drained = True
+            for bus in range(len(of.devices)):  # a frame of each in turn: so they are taken about as they were sent
+                if of.bus[bus] != bus or of.fds[bus] == _GONE:
+                    continue
+                got = _receive(of.fds[bus], frame)
+                if got < 0:
+                    of.fds[bus] = _GONE
+                    ended = 2 if _all_gone(of) else 1
+                if got <= 0:
+                    continue
+                drained = False
+                if got != FRAME_SIZE:
+                    continue
+                now_ns = monotonic_ns(timespec)
+                if _take_from_bus(of, faults, service_fd, bus, now_ns):
+                    stamped_ns = now_ns
+                _flush_all(faults, now_ns, of)
         while _receive(service_fd, frame) == FRAME_SIZE:
             _take_sdo_answer(of, monotonic_ns(timespec))
-            _flush_all(fd, faults, monotonic_ns(timespec), of)
+            _flush_all(faults, monotonic_ns(timespec), of)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
             _advance_all(of, woken_ns - lag_ns)
-            _flush_all(fd, faults, woken_ns, of)
+            _flush_all(faults, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
 
@@ -292,16 +326,24 @@ def _fault_rows(devices: Sequence[Cia402Device]) -> Any:
     return rows
 
 
+def _on_bus(frame: bytes, bus: int) -> bytes:
+    return frame[:_BUS_BYTE] + bytes([bus]) + frame[_BUS_BYTE + 1 :]
+
+
 class RealtimeDevice:
     """Runs the drives of a bus on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the
-    caller's.  Several drives: those of one `Cia402Device.row`, with the arm that connects their joints.
+    caller's.  Several drives: those of one `Cia402Device.row`, with the arm that connects their joints; `fd` may be
+    one a drive, the same for all of a bus.
     """
 
-    def __init__(self, devices: Cia402Device | Sequence[Cia402Device], fd: int, arm: ArmPlant | None = None) -> None:
+    def __init__(
+        self, devices: Cia402Device | Sequence[Cia402Device], fd: int | Sequence[int], arm: ArmPlant | None = None
+    ) -> None:
         self._arm = no_arm_plant() if arm is None else arm
         self._devices = [devices] if isinstance(devices, Cia402Device) else list(devices)
         self.plant_states = self._devices[0].whole_row.plant_states
-        self._fd = fd
+        fds = [fd] * len(self._devices) if isinstance(fd, int) else list(fd)
+        self._fds, self._bus = np.array(fds), np.array([fds.index(one) for one in fds])
         self.words = np.zeros(WORDS, np.int64)
         self._faults = _fault_rows(self._devices)
         self.fault_memory = new(FaultMemory, len(self._devices))
@@ -312,31 +354,34 @@ class RealtimeDevice:
 
     def _run(self, service_fd: int) -> None:
         row = self._devices[0].whole_row
-        scratch = np.zeros(FRAME_SIZE, np.uint8), np.zeros(4, np.int32), np.zeros(2, np.int64)
+        polls = np.zeros(2 * len(self._devices) + 2, np.int32)
         memory = DeviceMemory(
-            *row, new(FrameQueue, len(self._devices)), self._arm, self._faults, self.fault_memory, self.words, *scratch
-        )
-        run_device(self._fd, service_fd, memory)
+            *row, new(FrameQueue, len(self._devices)), self._arm, self._faults, self.fault_memory, self._bus,
+            self._fds.copy(), self.words, np.zeros(FRAME_SIZE, np.uint8), polls, np.zeros(2, np.int64),
+        )  # fmt: skip
+        run_device(service_fd, memory)
 
     def _serve(self, service: socket.socket) -> None:
         """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""
         with service:
             while True:
                 service.settimeout(_SDO_LOOK_S if any(device.sdo.busy for device in self._devices) else None)
-                responses: list[bytes] = []
+                responses: list[tuple[int, bytes]] = []
                 try:
                     frame = service.recv(FRAME_SIZE)
                 except TimeoutError:
-                    for device in self._devices:
-                        responses += device.expire_sdo(time.monotonic_ns())
+                    for bus, device in zip(self._bus, self._devices, strict=True):
+                        responses += [(bus, response) for response in device.expire_sdo(time.monotonic_ns())]
                 else:
                     if not frame:
                         return
-                    for device in self._devices:
-                        if device.is_addressed(frame):
-                            responses += device.answer_sdo(frame, time.monotonic_ns())
-                for response in responses:
-                    service.send(response)
+                    bus, frame = frame[_BUS_BYTE], _on_bus(frame, 0)
+                    for its_bus, device in zip(self._bus, self._devices, strict=True):
+                        if its_bus == bus and device.is_addressed(frame):
+                            answers = device.answer_sdo(frame, time.monotonic_ns())
+                            responses += [(bus, response) for response in answers]
+                for bus, response in responses:
+                    service.send(_on_bus(response, bus))
 
     def compile(self) -> None:
         """Compile, or load from the cache, what `start` runs; nothing is sent."""

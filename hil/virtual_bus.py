@@ -35,7 +35,7 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import errno, load_acquire, monotonic_ns, store_release
 from jointctl.firmware_py.schema import array_of, i4, i8, new, record, u1, u4
 from jointctl.hil.bus_timing import NO_NODE, Waiting, Wire, finish_frame, frame_bits, pend_frame
-from jointctl.hil.frame_stamps import SyncWatch, note_sent, over, stamp_of
+from jointctl.hil.frame_stamps import SyncWatch, note_sent, outlived, over, stamp_of
 
 # --- The virtual side's own statement of `struct can_frame` (16 bytes): identifier, length, three spare bytes, data ---
 # Deliberately not shared with the drivers: a wrong constant on one side must not cancel out on the other.
@@ -274,6 +274,9 @@ def _finish_frames(memory: HubMemory, now_ns: int, timing: bool | None) -> None:
         sender = finish_frame(wire, now_ns, memory.waiting, memory.on_wire, frames)
         if sender == NO_NODE:
             break
+        if outlived(memory.watch[0], memory.frame_bytes[0], sender, monotonic_ns(memory.scratch)):
+            memory.bus[0].late += 1
+            continue
         _deliver(sender, wire[0].bits, wire[0].bitrate_bitps, memory.clients, memory.bus, frames)
 
 

@@ -132,10 +132,12 @@ class LiveMotor:
                 from jointctl.tools.analysis.arm_check import load_torques
 
                 load_torques(self.axes.arm)
-            output, first = Output(quiet=True), self.axes.joints[0]
+            output = Output(quiet=True)
             others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
             self._stack.enter_context(self._bus)
-            control = self._control = self._bus.enter_context(in_program(first, output))
+            control = self._control = self._bus.enter_context(
+                in_program(self.axes.joints[0], output, self.axes.joints[1:])
+            )
             self._approval = _Approval(control.signals.leave_if_asked)
             plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
             self.log_paths = tuple(joint.log_path for joint in plan.joints)

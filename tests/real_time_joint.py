@@ -31,12 +31,16 @@ def schedule(thread: int, policy: int, priority: int) -> None:
 @contextmanager
 def real_time_joint(config: Config | ArmConfig) -> Iterator[Any]:
     """Bus and CANopen drives of `config`; only their compiled threads come first."""
-    before = set(threading.enumerate())
     with serve_virtual_joint(config) as joint:
-        for thread in set(threading.enumerate()) - before:
-            if thread.name != "device-sdo" and thread.name.startswith(COMPILED) and thread.native_id is not None:
-                schedule(thread.native_id, os.SCHED_FIFO, BEFORE_A_LOOP)
+        schedule_compiled()
         yield joint
+
+
+def schedule_compiled() -> None:
+    """The compiled threads of this process come first."""
+    for thread in threading.enumerate():
+        if thread.name != "device-sdo" and thread.name.startswith(COMPILED) and thread.native_id is not None:
+            schedule(thread.native_id, os.SCHED_FIFO, BEFORE_A_LOOP)
 
 
 @contextmanager

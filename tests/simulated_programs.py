@@ -49,7 +49,7 @@ from jointctl.hil.lockstep import World as Joint
 from jointctl.hil.virtual_bus import FrameQueue
 from jointctl.tools.configuration.arm import ArmConfig, ArmModel
 from jointctl.tools.configuration.canopen import canopen_settings
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
@@ -154,8 +154,8 @@ class World:
 
     def _let_joints_move(self) -> None:
         """All of them, up to now: each drive alone would move its joint as if it were no arm's."""
-        *row, queues, _, _, arm, _ = self.joints
-        advance_together(*row, self.now_ns, queues, arm)
+        of = self.joints
+        advance_together(of.device, of.plant_constants, of.plant, self.now_ns, of.queue, of.arm)
 
     def _advance(self, to_ns: int) -> None:
         self.now_ns = to_ns
@@ -307,9 +307,10 @@ class SimulatedLoop(LoopHandle):
     world: World
 
     def __init__(
-        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None,
-        arm: ArmModel | None = None,
+        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fds: Sequence[int] = (),
+        arm: ArmModel | None = None, joints: Sequence[Config] = (),
     ) -> None:  # fmt: skip
+        assert len(set(first_on_bus(joints))) <= 1, "this world has one bus"
         self.block = loop_memory.new_block(table, port, arm)
         self._tail = self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends

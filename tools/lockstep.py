@@ -41,7 +41,7 @@ from jointctl.hil.lockstep import (
 from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_settings
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
 from jointctl.tools.virtual_joint import new_device
@@ -438,6 +438,7 @@ class LockstepArm:
         return World(
             self._devices.copy(), plants[0], plants[1].copy(), self._queues.copy(), NO_FAULTS,
             fault_memory(NO_FAULTS, 0), ArmPlant(*(part.copy() for part in plant)),
+            bus=np.array(first_on_bus(self.arm.joints)),
         )  # fmt: skip
 
     def _carry_out(self, constants: Any, model: Arm, world: World, **how: Any) -> list[LockstepRun]:

@@ -10,7 +10,7 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
@@ -29,7 +29,7 @@ from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.configuration.plant_settings import (
     VIRTUAL_EDS,
     arm_plant_of,
@@ -151,37 +151,38 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
     return devices
 
 
-def _start_bus(stack: ExitStack, config: Config, timing: bool) -> None:
-    path = default_socket_path(config.bus.channel)
-    try:
-        stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
-    except VirtualBusError as error:
-        raise BusError(str(error)) from None
+def _start_buses(stack: ExitStack, configs: Iterable[Config], timing: bool) -> None:
+    for config in configs:
+        path = default_socket_path(config.bus.channel)
+        try:
+            stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
+        except VirtualBusError as error:
+            raise BusError(str(error)) from None
 
 
 @contextmanager
 def serve_virtual_joint(
     given: Config | ArmConfig, timing: bool = False, bus_is_up: Callable[[], None] | None = None
 ) -> Iterator[RealtimeDevice | PumpedDevice]:
-    """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already.
+    """Drive in threads of this process; the bus as well if it is a virtual one, all others exist already.
 
-    Those of an arm are on the bus of the first one.  A bus that can be found has a drive that answers, unless somebody
-    is told with `bus_is_up` that there is a bus already, and waits for the drive.
+    A bus that can be found has a drive that answers, unless the caller is notified with `bus_is_up` that there is a bus
+    already, and waits for the drive.
     """
     joints = [given] if isinstance(given, Config) else list(given.joints)
-    config = joints[0]
+    config, buses = joints[0], first_on_bus(joints)
     with ExitStack() as stack:
-        own_bus = config.bus.interface == "jointctl"
-        if own_bus and bus_is_up is not None:
-            _start_bus(stack, config, timing)
+        own_buses = [joints[axis] for axis in sorted(set(buses)) if joints[axis].bus.interface == "jointctl"]
+        if bus_is_up is not None:
+            _start_buses(stack, own_buses, timing)
             bus_is_up()
         arm, devices = None if isinstance(given, Config) else arm_plant_of(given), new_devices(joints)
         if config.bus.interface in CYCLIC_INTERFACES:
             gc.disable()  # what a compiler leaves behind is little beside what it holds
             RealtimeDevice(devices, -1, arm).compile()
             gc.enable()
-        if own_bus and bus_is_up is None:
-            _start_bus(stack, config, timing)
+        if bus_is_up is None:
+            _start_buses(stack, own_buses, timing)
         if config.bus.interface not in CYCLIC_INTERFACES:
             if len(devices[0].faults):
                 raise ConfigurationError(
@@ -192,8 +193,11 @@ def serve_virtual_joint(
             stack.callback(bus.shutdown)
             yield stack.enter_context(PumpedDevice(devices[0], bus))
             return
-        end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
-        yield stack.enter_context(RealtimeDevice(devices, end.fileno(), arm))
+        ends = {
+            axis: stack.enter_context(open_cyclic_end(joints[axis].bus.interface, joints[axis].bus.channel)).fileno()
+            for axis in sorted(set(buses))
+        }
+        yield stack.enter_context(RealtimeDevice(devices, [ends[axis] for axis in buses], arm))
 
 
 # --- The virtual joint behind a virtual Elmo drive on a pseudo-terminal, as a configuration describes both ---

@@ -88,7 +88,8 @@ class SecondPosition:
 class CanopenPort:
     """Identifiers, layout and scaling (set by commissioning), and what has been seen on the bus."""
 
-    fd: i4
+    fd: i4  # of the bus, in the record of its first drive
+    bus: i4  # axis of the first drive on the same bus
     node: i4
     sync_id: u4
     tpdo_id: u4

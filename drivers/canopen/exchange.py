@@ -1,4 +1,5 @@
-"""The cyclic protocol on a file descriptor, for all drives of a bus: what the compiled loop calls each cycle.
+"""The cyclic protocol on file descriptors, for all drives of one or several buses: what the compiled loop calls each
+cycle.
 
 `receive` and `send` are exported with a fixed C signature, so that the loop in firmware_py can take them as arguments.
 """
@@ -18,6 +19,7 @@ from jointctl.drivers.canopen.cyclic import (
     SLOT_OFFSET,
     SLOT_RECEIVED,
     SLOT_RPDO,
+    SLOT_SYNC,
     CanopenPort,
     accept_frame,
     answer_owed,
@@ -27,11 +29,11 @@ from jointctl.drivers.canopen.cyclic import (
 )
 from jointctl.drivers.drive import LOOK_LATE_NS
 from jointctl.firmware_py.kernel import exported, kernel, memory_type, record_array_type
-from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, monotonic_ns, wait_readable_ns
+from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, monotonic_ns, wait_watched_ns, watch
 from jointctl.firmware_py.libc import recv as receive_bytes
 from jointctl.firmware_py.libc import send as send_bytes
 from jointctl.firmware_py.records import Command, Sample
-from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.schema import INT32_MAX, dtype_of, new
 
 # --- 16-byte CAN frames on a file descriptor, from inside the control loop ---
 # The same code serves an AF_CAN raw socket and an AF_UNIX SEQPACKET socket of the virtual bus: on both, one datagram
@@ -92,12 +94,12 @@ def receive_frame(fd: int, frames: np.ndarray, index: int) -> int:
 class CanopenLink(NamedTuple):
     """The memory of the exchange: a record of each drive, the frames that are sent and received, scratch.
 
-    The drives are on one bus, that of the first record, and answer one SYNC.
+    The drives of a bus answer its SYNC.  Each bus gets its own, one right after the other, and all the same heartbeats.
     """
 
     port: Any  # CanopenPort[axes]
     frames: Any  # Frame[FRAME_SLOTS]
-    scratch: np.ndarray  # int64[SCRATCH_WORDS]
+    scratch: np.ndarray  # int64[SCRATCH_WORDS or more]
 
 
 _SAMPLES = record_array_type(dtype_of(Sample))
@@ -107,7 +109,7 @@ _LINK = memory_type(CanopenLink, dtype_of(CanopenPort), dtype_of(Frame), np.dtyp
 
 def link_of(port: Any) -> CanopenLink:
     """`port` CanopenPort[axes] with the other memory of the exchange."""
-    return CanopenLink(port, new(Frame, FRAME_SLOTS), np.zeros(SCRATCH_WORDS, np.int64))
+    return CanopenLink(port, new(Frame, FRAME_SLOTS), np.zeros(max(SCRATCH_WORDS, len(port) + 2), np.int64))
 
 
 @kernel
@@ -131,10 +133,52 @@ def _note_sent(port: CanopenPort, sample: Sample, error: int, last: bool) -> Non
 def _drain(ports: np.ndarray, frames: np.ndarray, samples: np.ndarray, now_ns: int) -> bool:
     """Take every frame that is waiting; True if a sample was among them (of several, the last one counts)."""
     found = False
-    while receive_frame(ports[0].fd, frames, SLOT_RECEIVED) == 1:
-        for axis in range(len(ports)):
-            found |= accept_frame(ports[axis], frames[SLOT_RECEIVED], samples[axis], now_ns)
+    for bus in range(len(ports)):
+        while ports[bus].bus == bus and receive_frame(ports[bus].fd, frames, SLOT_RECEIVED) == 1:
+            for axis in range(bus, len(ports)):
+                if ports[axis].bus == bus:
+                    found |= accept_frame(ports[axis], frames[SLOT_RECEIVED], samples[axis], now_ns)
     return found
+
+
+@kernel
+def _on_several_buses(ports: np.ndarray) -> bool:
+    for axis in range(1, len(ports)):
+        if ports[axis].bus != 0:
+            return True
+    return False
+
+
+@kernel
+def _request(link: CanopenLink, samples: np.ndarray, to_send: int) -> None:
+    """Send SYNC to every bus, one right after the other, and then the heartbeat to every bus when it is due."""
+    ports, frames, first_ns = link.port, link.frames, 0
+    several = _on_several_buses(ports)
+    for slot in range(to_send):
+        for bus in range(len(ports)):
+            if ports[bus].bus != bus:
+                continue
+            error, late_ns = send_frame(ports[bus].fd, frames, slot), 0
+            if several and slot == SLOT_SYNC:
+                now_ns = monotonic_ns(link.scratch)
+                first_ns = now_ns if bus == 0 else first_ns
+                late_ns = min(now_ns - first_ns, INT32_MAX)
+            for axis in range(bus, len(ports)):
+                if ports[axis].bus == bus:
+                    _note_sent(ports[axis], samples[axis], error, False)
+                    if slot == SLOT_SYNC:
+                        samples[axis].sync_late_ns = late_ns
+
+
+@kernel
+def _wait_for_frames(ports: np.ndarray, timeout_ns: int, scratch: np.ndarray) -> None:
+    """Sleep until a frame waits on a bus; one of several that takes nothing any more would be an end at once."""
+    count, several = 0, _on_several_buses(ports)
+    for bus in range(len(ports)):
+        if ports[bus].bus == bus and not (several and ports[bus].consecutive_failures > 0):
+            watch(ports[bus].fd, count, scratch)
+            count += 1
+    wait_watched_ns(count, timeout_ns, scratch)
 
 
 @kernel
@@ -163,12 +207,9 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
     _drain(ports, frames, samples, now_ns)
     owed = _any_owed(ports)
     to_send = FRAME_SLOTS
-    for axis in range(len(ports)):  # a drive that ignores a stop keeps the heartbeat from all
+    for axis in range(len(ports)):  # a drive that ignores a stop keeps the heartbeat from all, on every bus
         to_send = min(to_send, begin_cycle(ports[axis], frames))
-    for slot in range(to_send):
-        error = send_frame(ports[0].fd, frames, slot)
-        for axis in range(len(ports)):
-            _note_sent(ports[axis], samples[axis], error, False)
+    _request(link, samples, to_send)
     started_ns = monotonic_ns(link.scratch)
     arrived_ns = started_ns
     while arrived_ns <= until_ns + LOOK_LATE_NS:
@@ -176,7 +217,7 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
             return monotonic_ns(link.scratch) - started_ns
         if arrived_ns >= until_ns:
             return arrived_ns - started_ns
-        wait_readable_ns(ports[0].fd, until_ns - arrived_ns, link.scratch)
+        _wait_for_frames(ports, until_ns - arrived_ns, link.scratch)
         arrived_ns = monotonic_ns(link.scratch)
     return arrived_ns - started_ns
 
@@ -187,9 +228,10 @@ def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
     ports, failed = link.port, 0
     for axis in range(len(ports)):
         end_cycle(ports[axis], link.frames, samples[axis], commands[axis])
+        fd = ports[ports[axis].bus].fd
         if ports[axis].offset_rpdo_id != 0:
-            _note_sent(ports[axis], samples[axis], send_frame(ports[0].fd, link.frames, SLOT_OFFSET), False)
-        error = send_frame(ports[0].fd, link.frames, SLOT_RPDO)
+            _note_sent(ports[axis], samples[axis], send_frame(fd, link.frames, SLOT_OFFSET), False)
+        error = send_frame(fd, link.frames, SLOT_RPDO)
         _note_sent(ports[axis], samples[axis], error, True)
         if error != 0:
             failed = error

@@ -69,8 +69,12 @@ def _answer(memory: CycleMemory, samples: np.ndarray, now_ns: int, until_ns: int
         sample.count += 1
         sample.time_ns = now_ns + 1
         sample.position_rad = memory.state[axis].reference.position_rad
-        enabled = memory.command[axis].request == DriveRequest.ENABLE
-        sample.drive_state = DriveState.ENABLED if enabled else DriveState.OFF
+        request = memory.command[axis].request
+        sample.drive_state = DriveState.OFF
+        if request == DriveRequest.PREPARE:
+            sample.drive_state = DriveState.PREPARED
+        elif request == DriveRequest.ENABLE:
+            sample.drive_state = DriveState.ENABLED
     return 1
 
 

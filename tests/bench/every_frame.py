@@ -1,7 +1,7 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
     python tests/bench/every_frame.py [--kind run|sweep|program|arm] [--mode cst|csp|csv] [--deadline yes|no]
-                                      [--every 1] [--rest 20]
+                                      [--every 1] [--offset 0] [--rest 20]
                                       [--workers 2] [--phase NAME] [--injection NAME]
                                       [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
@@ -543,6 +543,7 @@ def main() -> int:
     parser.add_argument("--mode", choices=("cst", "csp", "csv"), default="cst", help="drive.mode of a joint")
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
+    parser.add_argument("--offset", type=int, default=0, help="other ones of them: so many frames earlier")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler whose workers have this clone at this path")
@@ -558,6 +559,7 @@ def main() -> int:
             kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout, given.mode
         )
         one.phases, one.injections = given.phase or [], given.injection or one.injections
+        one.chosen = given.offset
         sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
         return 0
     workers = Workers(given.workers, given.cluster)
@@ -573,6 +575,7 @@ def main() -> int:
                 given.mode,
                 "--rest",
                 str(given.rest),
+                f"--offset={given.offset}",
                 *(f"--phase={name}" for name in given.phase or []),
             ]
             words += [f"--injection={name}" for name in given.injection or []]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -439,9 +440,38 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
     yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
 
 
-def arm_for_comparison(channel: str) -> ArmConfig:
-    """The shipped arm with the law that the C source knows; ours has the arm's model besides."""
-    arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
+LONG_ARM, LONG_RATE_Hz = 7, 500.0  # joints: 83.3 % of a bus
+_LINK = """  <link name="link{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.4"/>
+    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial></link>
+  <joint name="joint{i}" type="revolute"><parent link="{parent}"/><child link="link{i}"/><origin xyz="0.1 0 0"/>
+    <axis xyz="{axis}"/><limit lower="-1.5" upper="1.5" velocity="3.4" effort="150"/></joint>
+"""
+
+
+def long_arm(folder: Path) -> Path:
+    """The file of an arm of seven light links, with the shipped shoulder's drives and softer gains at 500 Hz."""
+    text = (SHIPPED_ARM.parent / "shoulder.toml").read_text()
+    for key, value in (("rate_Hz", LONG_RATE_Hz), ("kp", 900.0), ("kv", 60.0), ("observer_radps", 20.0)):
+        text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+        assert count == 1, key
+    links = ""
+    for i in range(LONG_ARM):
+        (folder / f"joint{i}.toml").write_text(re.sub(r"(?m)^node = 1", f"node = {i + 1}", text))
+        axis = ("0 0 1", "0 1 0")[i % 2]
+        links += _LINK.format(i=i, parent=f"link{i - 1}" if i else "base", axis=axis)
+    (folder / "arm.urdf").write_text(f'<robot name="long">\n  <link name="base"/>\n{links}</robot>\n')
+    path = folder / "arm.toml"
+    path.write_text(
+        f"[arm]\nurdf = 'arm.urdf'\njoints = {[f'joint{i}.toml' for i in range(LONG_ARM)]}\n"
+        f"motor_inertia_kgm2 = {[2.2] * LONG_ARM}\n\n[motion]\nkind = 'sine'\nduration_s = 0.0\n"
+        f"amplitude_rad = {[0.2] * LONG_ARM}\nfrequency_Hz = {[0.2 + 0.05 * i for i in range(LONG_ARM)]}\n"
+    )
+    return path
+
+
+def arm_for_comparison(path: Path, channel: str) -> ArmConfig:
+    """An arm with the law that the C source knows; ours has the arm's model besides."""
+    arm = arm_on_bus(load_arm(path), GivenPlace("jointctl", channel))
     joints = tuple(
         changed(
             joint, control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,
@@ -453,15 +483,18 @@ def arm_for_comparison(channel: str) -> ArmConfig:
 
 
 def arm_exchange_rows(folder: Path, *, rounds: int, seconds: float) -> Iterator[Row]:
-    """Three drives against the same exchange in C: a virtual arm of its own, on a virtual bus that models bit times."""
+    """Three and seven drives against the same exchange in C: virtual arms, on a virtual bus that models bit times."""
     try:
         program = exchange_program(folder)
     except NoCompilerError as error:
-        yield skipped(GROUP, "3 joints, against a C loop", error.message)
+        yield skipped(GROUP, "an arm against a C loop", error.message)
         return
-    channel = f"bench-arm{os.getpid()}"
-    with separate_virtual_joint(SHIPPED_ARM, channel, timing=True):
-        yield from _against_c(Case(arm_for_comparison(channel), "idle", seconds), program, rounds)
+    long = folder / "long-arm"
+    long.mkdir()
+    for path in (SHIPPED_ARM, long_arm(long)):
+        channel = f"bench-{path.parent.name}{os.getpid()}"
+        with separate_virtual_joint(path, channel, timing=True):
+            yield from _against_c(Case(arm_for_comparison(path, channel), "idle", seconds), program, rounds)
 
 
 def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: float, quick: bool) -> Iterator[Row]:

@@ -26,6 +26,7 @@ from jointctl.hil.frame_stamps import (
     SHORTEST_WINDOW_US,
     SyncWatch,
     note_sent,
+    outlived,
     over,
     sent_ns_of,
     stamp_frame,
@@ -205,6 +206,20 @@ def test_a_pdo_of_the_controller_or_another_sync_closes_the_cycle(identifier: in
     watch, stamp, sync_ns = watched(3)
     note_sent(watch, bytes_of(frame(identifier)), sender, sync_ns + 100_000)
     assert over(watch, stamp, sync_ns + 150_000) == closed
+
+
+@pytest.mark.parametrize(
+    ("identifier", "sender", "age_us", "left_out"),
+    [(0x185, 1, 1000, False), (0x185, 1, 1001, True), (0x205, 0, 3000, False), (0x705, 1, 3000, False)],
+)
+def test_an_answer_that_was_on_the_wire_for_a_period_is_left_out(
+    identifier: int, sender: int, age_us: int, left_out: bool
+) -> None:
+    """A hub that stood still delivered the position of three periods ago, which looked like a leap at speed."""
+    watch = new(SyncWatch)[0]
+    watch.sender, watch.period_us = 0, 1000
+    answer = np.frombuffer(frame(identifier, bytes(8), 5_000_000_000), np.uint8).copy()
+    assert outlived(watch, answer, sender, 5_000_000_000 + 1000 * age_us) == left_out
 
 
 def test_the_period_follows_the_loop_down_at_once_and_up_slowly() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
@@ -32,7 +32,7 @@ def snapshot(**fields: Any) -> Snapshot:
     record.error_rad, record.command_torque_Nm, record.trajectory_s = 1.5e-3, -20.0, 4.0
     for name, value in fields.items():
         record[name] = value
-    histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+    histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
     histograms[0, 40] = 100
     return Snapshot(record[0], 3, histograms, 10.0)
 

@@ -38,6 +38,7 @@ class BusBudget:
     bits: int  # of a cycle, at worst
     load: float
     fitting_Hz: float  # the highest rate of `RATES_Hz` that fits; 0 if none does
+    buses: tuple[tuple[str, ...], ...]  # on which the joints fit at the loop's rate, in their order; () if on none
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,25 @@ def bus_budgets(arm: ArmConfig) -> list[BusBudget]:
         most_Hz = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
         fitting = next((rate for rate in RATES_Hz if rate <= most_Hz), 0)
         bits = round(load * bitrate / arm.rate_Hz)
-        budgets.append(BusBudget(channel, tuple(name for name, _ in joints), bits, load, float(fitting)))
+        names, split = tuple(name for name, _ in joints), _split(joints, arm.rate_Hz, bitrate)
+        budgets.append(BusBudget(channel, names, bits, load, float(fitting), split))
     return budgets
+
+
+def _split(joints: list[tuple[str, Config]], rate_Hz: float, bitrate: int) -> tuple[tuple[str, ...], ...]:
+    """The joints' names on as few buses as carry them, neighbours together; () where one is too much for a bus."""
+    buses: list[list[str]] = []
+    lengths: list[int] = []
+    for name, config in joints:
+        own = cycle_bytes(config)[1:]
+        if not buses or bus_load([*lengths, *own], rate_Hz, bitrate) > HIGHEST_LOAD:
+            buses.append([])
+            lengths = [0]
+        lengths += own
+        buses[-1].append(name)
+        if bus_load(lengths, rate_Hz, bitrate) > HIGHEST_LOAD:
+            return ()
+    return tuple(map(tuple, buses))
 
 
 def require_budgets(arm: ArmConfig) -> list[BusBudget]:
@@ -84,11 +102,15 @@ def require_budgets(arm: ArmConfig) -> list[BusBudget]:
     if full:
         worst = max(full, key=lambda budget: budget.load)
         fits = f"{worst.fitting_Hz:g} Hz fits" if worst.fitting_Hz else "no rate of [100..4000] fits"
+        more = "at this rate one of them alone is too much for a bus"
+        if worst.buses:
+            split = " + ".join(str(len(names)) for names in worst.buses)
+            more = f"at this rate they fit on {len(worst.buses)} buses, as {split} joints"
         raise ConfigurationError(
             f"{arm.path}: bus {worst.channel}: {len(worst.joints)} joints ({', '.join(worst.joints)}) need "
             f"{worst.bits} bits a cycle, {worst.load:.1%} of the bus at loop.rate_Hz (={arm.rate_Hz:g}), "
             f"{HIGHEST_LOAD:.0%} allowed",
-            f"{fits} in every joint's file, or put some of the joints on a second bus",
+            f"{fits} in every joint's file; {more}: bus.channel of each",
         )
     return budgets
 

@@ -251,7 +251,7 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     names, remarks = _names(path, arm, urdf)
     bodies, inertias = _bodies(path, arm, urdf, names, alone)
     joints = _moved(path, file.motion, alone, names)
-    raise_if([f"{path}: {line}" for line in (*_bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
+    raise_if([f"{path}: {line}" for line in (*bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
     return ArmConfig(
         path, text, arm, joints, names, urdf, tuple(bodies), _model(arm, bodies, inertias), (*converted, *remarks)
     )
@@ -332,7 +332,7 @@ def _nodes(config: Config) -> Iterator[tuple[str, int]]:
         yield "joint_encoder.node", encoder.node
 
 
-def _bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
+def bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
     """Nodes, rates and buses of the joints against each other."""
     other = [(name, c) for name, c in zip(arm.joints, joints, strict=True) if not isinstance(c.drive, CanopenSection)]
     if other:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -84,6 +84,12 @@ class Config(Section):
     @property
     def table_path(self) -> Path | None:
         return beside(self._path, self.trajectory.file) if self.trajectory.kind == "table" else None
+
+
+def first_on_bus(joints: Iterable[Config]) -> list[int]:
+    """Of each joint of an arm the number of the first joint that is on the same bus."""
+    places = [(config.bus.interface, config.bus.channel) for config in joints]
+    return [places.index(place) for place in places]
 
 
 def beside(config_path: Path, name: str) -> Path:

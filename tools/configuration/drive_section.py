@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -37,6 +37,12 @@ class GivenPlace:
     def bus(self) -> str | int | None:
         """What names a CAN bus; None if nothing does."""
         return next((value for value in (self.interface, self.channel, self.bitrate) if value is not None), None)
+
+    def of_bus(self, number: int) -> GivenPlace:
+        """For the drives on one of an arm's buses, which are counted from 0: on the second virtual bus NAME.2."""
+        if number == 0 or self.channel is None:
+            return self
+        return replace(self, channel=f"{self.channel}.{number + 1}")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ millimetres or grams would give.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,10 @@ from jointctl.tools.configuration.config import raise_if
 
 # beyond these a number is taken for one in another unit
 LARGEST_LENGTH_m, LARGEST_MASS_kg, LARGEST_TURN_rad, LARGEST_SPEED_radps = 10.0, 1000.0, 2.0 * math.tau, 50.0
+LARGEST_RPY_rad = math.tau + 1e-3  # of an origin: where one turn has everything
 LEAST_MASS_kg = 1e-6
+MOST_LINKS = 1000
+_NAMED = 5  # of many elements in one message
 _ROUNDING = 1e-3  # of an inertia's largest moment, by which the digits of the file may violate what holds for bodies
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -120,10 +124,10 @@ def read_urdf(path: Path) -> Urdf:
         content = read_input(path)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise ConfigurationError(f"{path}: must have no DOCTYPE and no entities")
+    parser = ElementTree.XMLParser(target=_NoDoctype(path))
     try:
-        robot = ElementTree.fromstring(content)
+        parser.feed(content)
+        robot = parser.close()
     except ElementTree.ParseError as error:
         raise ConfigurationError(f"{path}: not valid XML: {error}") from None
     if robot.tag != "robot":
@@ -131,16 +135,33 @@ def read_urdf(path: Path) -> Urdf:
     return _Reader(path).read(robot)
 
 
+class _NoDoctype(ElementTree.TreeBuilder):
+    """Entities need one, in whatever encoding the file is."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+
+    def doctype(self, *_: str | None) -> None:
+        """Called before anything that it declares is read."""
+        raise ConfigurationError(f"{self._path}: must have no DOCTYPE and no entities")
+
+
 class _Reader:
     def __init__(self, path: Path) -> None:
         self._path, self._problems = path, list[str]()
 
     def read(self, robot: ElementTree.Element) -> Urdf:
+        for tag in ("link", "joint"):
+            if (count := len(robot.findall(tag))) > MOST_LINKS:
+                raise ConfigurationError(f"{self._path}: {count} elements {tag}, at most {MOST_LINKS} are read")
         links = {self._name(one, "link"): one for one in robot.findall("link")}
         joints = {self._name(one, "joint"): self._joint(one) for one in robot.findall("joint")}
-        for tag, known in (("link", links), ("joint", joints)):
-            if len(known) != len(robot.findall(tag)):
-                self._problem(f"two of the elements {tag} have the same name")
+        for tag in ("link", "joint"):
+            counts = Counter(one.get("name", "") for one in robot.findall(tag))
+            for name, count in counts.items():
+                if name and count > 1:
+                    self._problem(f"{tag} {name} is there {count} times: each must have a name of its own")
         raise_if(self._problems)
         found = Urdf(self._path, *self._tree(links, joints))
         raise_if(self._problems)
@@ -180,7 +201,7 @@ class _Reader:
         zeros = (0.0, 0.0, 0.0)
         offset = self._numbers(origin, "xyz", f"{what}: xyz", zeros, LARGEST_LENGTH_m, "millimetres instead of m")
         roll, pitch, yaw = self._numbers(
-            origin, "rpy", f"{what}: rpy", zeros, LARGEST_TURN_rad, "degrees instead of rad"
+            origin, "rpy", f"{what}: rpy", zeros, LARGEST_RPY_rad, "degrees instead of rad"
         )
         return Pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), offset)
 
@@ -204,12 +225,15 @@ class _Reader:
             return float(self._numbers(limit, attribute, f"{what}: limit {attribute}", (0.0,), most, why)[0])
 
         ranged = kind == "revolute"  # a continuous joint has none
+        low, high = (given(end, largest, unit) if ranged else None for end in ("lower", "upper"))
+        if low is not None and high is not None and not low < high:
+            self._problem(f"{what}: limit lower (={low:g}) must be below upper (={high:g})")
         return UrdfJoint(
             name=name, kind=kind, parent=self._child(element, "parent", what),
             child=self._child(element, "child", what), origin=self._origin(element, what), axis=axis / length,
             mimics=None if mimic is None else mimic.get("joint", ""),
-            lower_rad=given("lower", largest, unit) if ranged else None,
-            upper_rad=given("upper", largest, unit) if ranged else None,
+            lower_rad=low,
+            upper_rad=high,
             velocity_max_radps=given("velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
             effort_max_Nm=given("effort", 1e6, "Nm"),
         )  # fmt: skip
@@ -275,7 +299,8 @@ class _Reader:
         raise_if(self._problems)
         roots = [link for link in links if link not in above]
         if not links or len(roots) != 1:
-            names = ", ".join(roots) or "none"
+            more = f" and {len(roots) - _NAMED} more" if len(roots) > _NAMED else ""
+            names = (", ".join(roots[:_NAMED]) or "none") + more
             self._problem(f"one link must have no joint above it, here: {names}; links must form a tree without loops")
         raise_if(self._problems)
         order: list[UrdfJoint] = []

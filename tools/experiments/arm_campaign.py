@@ -23,6 +23,7 @@ joint fall until the drive has given up its stop ramp.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,7 +41,7 @@ from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.analysis.arm_check import pose_models
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
@@ -82,7 +83,7 @@ RIPPLE_SHARE = 0.4  # of what is drawn for that joint, at the same torque
 PAPER_BRISTLE_Nmprad = 8e4
 INERTIA_SCALES = (0.95, 1.05)
 OF_TORQUE = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.LOAD_JUMP})  # magnitudes in Nm
-# of the computer, so of all joints at once
+# of the computer, so of all joints at once; of an adapter, of all on its bus
 COMMON = frozenset(
     {FaultKind.BUS_OFF, FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT}
 )  # fmt: skip
@@ -100,6 +101,13 @@ class ArmScenario:
     @property
     def fault(self) -> Scenario:
         return self.joints[self.faulty]
+
+    def touched(self, joints: Sequence[Config]) -> list[int]:
+        """Those that have the fault at once."""
+        buses = first_on_bus(joints)
+        if self.fault.kind is FaultKind.BUS_OFF:
+            return [axis for axis, bus in enumerate(buses) if bus == buses[self.faulty]]
+        return list(range(len(joints))) if self.fault.kind in COMMON else [self.faulty]
 
     def describe(self) -> dict[str, Any]:
         """For JSON and people."""
@@ -214,8 +222,9 @@ def envelopes(joints: LockstepArm, masses: Masses, scenario: ArmScenario, consta
         pushes[scenario.faulty] += abs(fault.magnitude)
     push = masses.inverse @ pushes
     speed_limits = np.array([config.limits.velocity_max_radps for config in arm.joints])
+    touched = scenario.touched(arm.joints)
     waits = np.array([
-        reaction_s(config, fault.kind if fault.kind in COMMON or axis == scenario.faulty else FaultKind.NONE)
+        reaction_s(config, fault.kind if axis in touched else FaultKind.NONE)
         for axis, config in enumerate(arm.joints)
     ])  # fmt: skip
     brakes = np.minimum([config.sequence.brake_radps2 for config in arm.joints], joints.quick_stop_radps2)
@@ -308,7 +317,7 @@ def judge_arm(joints: LockstepArm, masses: Masses, scenario: ArmScenario) -> Ver
         found += [f"{name}: {line}" for line in wrong]
         off_s.append(off)
     found += _torque_before_all(runs, start_ns, period_ns) + _not_together(runs)
-    found += _wrong_report(runs, scenario, names, fault_rows, start_ns, period_ns)
+    found += _wrong_report(runs, scenario, joints.arm, fault_rows, start_ns, period_ns)
     fault, named = scenario.fault, runs[fault_rows.index(first)]
     beyond = [beyond_rad(run, one.limits) for run, one in zip(runs, constants, strict=True)]
     worst = int(np.argmax(beyond))
@@ -350,17 +359,18 @@ def _not_together(runs: list[LockstepRun]) -> list[str]:
 
 
 def _wrong_report(
-    runs: list[LockstepRun], scenario: ArmScenario, names: tuple[str, ...], fault_rows: list[int], start_ns: int,
+    runs: list[LockstepRun], scenario: ArmScenario, arm: ArmConfig, fault_rows: list[int], start_ns: int,
     period_ns: int,
 ) -> list[str]:  # fmt: skip
     """The joint and the cause that are reported first, and what others report after it."""
-    fault, faulty = scenario.fault, scenario.faulty
+    fault, faulty, names = scenario.fault, scenario.faulty, arm.names
+    touched = scenario.touched(arm.joints)
     first = min((row for row in fault_rows if row >= 0), default=-1)
     earliest = [axis for axis, row in enumerate(fault_rows) if row == first]
-    if fault.kind in COMMON:
-        reported = earliest[0]
-    elif first < 0 or faulty in earliest:
+    if first < 0 or faulty in earliest:
         reported = faulty
+    elif common := [axis for axis in earliest if axis in touched]:
+        reported = common[0]
     elif Fault.LIMIT_CYCLE in FAULT_CLASSES[fault.kind].causes and runs[earliest[0]].fault is Fault.LIMIT_CYCLE:
         reported = earliest[0]  # a joint that swings shakes the others, and a lighter one shows it first
     else:
@@ -373,9 +383,10 @@ def _wrong_report(
     if fault.harmless:
         return found or [f"{names[axis]}: a harmless fault of {names[faulty]} tripped {run.fault.name}"
                          for axis, run in enumerate(runs) if run.fault is not Fault.NONE]  # fmt: skip
-    after = MOTION | LATE_CAUSES | (FAULT_CLASSES[fault.kind].causes if fault.kind in COMMON else frozenset())
     return found + [
         f"{names[axis]}: reported {run.fault.name} after it"
         for axis, run in enumerate(runs)
-        if axis != reported and run.fault is not Fault.NONE and run.fault not in after
+        if axis != reported
+        and run.fault is not Fault.NONE
+        and run.fault not in MOTION | LATE_CAUSES | (FAULT_CLASSES[fault.kind].causes if axis in touched else set())
     ]

@@ -17,6 +17,7 @@ import numpy as np
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
@@ -89,6 +90,7 @@ class RunSummary:
     skipped_cycles: int
     oldest_sample_cycles: int
     temperature_degC: Range | None = None  # of the drive, as it tells it
+    sync_spread: TimeSummary | None = None  # between the SYNCs of several buses, of an arm
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and texts for JSON; the unit of each is in its key."""
@@ -104,7 +106,7 @@ def summarise(
 ) -> RunSummary:
     """Summary of `records` (array of LogRecord, shape (N,)).
 
-    `histograms` int64[3, bins of 1 us], rows wake-up, round trip, work, the last bin open: where given, the deadline
+    `histograms` int64[4, bins of 1 us], rows as of `Histogram`, the last bin open: where given, the deadline
     statistics come from it, because the loop counts every cycle there even if the log lost some.
     `late_from_s` is a trajectory time, `temperatures_degC` what the drive has reported.
     """
@@ -131,6 +133,7 @@ def summarise(
         skipped_cycles=int(records["skipped"].sum()),
         oldest_sample_cycles=int(records["sample_age_cycles"].max()) if len(records) else 0,
         temperature_degC=_range(np.asarray(temperatures_degC, float)),
+        sync_spread=None if histograms is None else histogram_times(histograms[Histogram.SYNC_SPREAD]),
     )
 
 
@@ -209,7 +212,7 @@ def summary_table(summary: RunSummary) -> Table:
         torque: Range | None = getattr(summary, key)
         if torque is not None and (torque.least, torque.greatest) != (0.0, 0.0):  # zero: the law has no such part
             table.add_row(name, f"{torque.least:.2f} .. {torque.greatest:.2f} Nm")
-    for name, key in TIMES.items():
+    for name, key in (*TIMES.items(), ("SYNC of all buses", "sync_spread")):
         times: TimeSummary | None = getattr(summary, key)
         if times is not None:
             table.add_row(f"{name}, p50/p99/p99.9/max", _times_text(times))

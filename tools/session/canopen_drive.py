@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
 from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
@@ -54,20 +55,25 @@ class CanopenSession(SessionDrive):
         return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
 
     def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
-        """See `SessionDrive`; all drives share one end of the bus."""
+        """See `SessionDrive`; all drives of a bus share one end of it."""
         from jointctl.drivers.canopen.drive import CanopenDrive
 
         if len(configs) == 1:
             return DriveGroup([self.open(configs[0], gate)])
-        require_one_bus(configs)
-        first = self.open(configs[0], gate)
-        assert isinstance(first, CanopenDrive)
-        try:
-            others = [CanopenDrive(first, canopen_settings(config), gate=gate) for config in configs[1:]]
-        except BaseException:
-            first.close()
-            raise
-        return DriveGroup([first, *others])
+        require_buses(configs)
+        drives: list[CanopenDrive] = []
+        buses = first_on_bus(configs)
+        with contextlib.ExitStack() as stack:
+            for axis, config in enumerate(configs):
+                if buses[axis] < axis:
+                    drives.append(CanopenDrive(drives[buses[axis]], canopen_settings(config), gate=gate))
+                    continue
+                first = self.open(config, gate)
+                assert isinstance(first, CanopenDrive)
+                stack.callback(first.close)
+                drives.append(first)
+            stack.pop_all()
+        return DriveGroup(drives, buses)
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
         kind, rate_Hz = canopen_section(config).rpdo_transmission_type, config.loop.rate_Hz
@@ -88,30 +94,26 @@ class CanopenSession(SessionDrive):
     def in_fault(self, status_word: int) -> bool:
         return state_of_word(status_word) in _BAD
 
-    def bits_sent(self, ports: Any) -> float:
+    def bits_sent(self, ports: Any, axis: int = 0) -> float:
         """Each drive's exchange counts what it sends itself, SYNC, and everything that it receives."""
-        others = sum(int(port.cycle) * worst_frame_bits(int(port.rpdo_length)) for port in ports[1:])
-        return float(ports[0].bits_sent) + others
+        first, *others = ports[ports.bus == ports[axis].bus]
+        of_others = sum(int(port.cycle) * worst_frame_bits(int(port.rpdo_length)) for port in others)
+        return float(first.bits_sent) + of_others
 
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"
 
 
-def require_one_bus(configs: Sequence[Config]) -> None:
-    """`ConfigurationError` for joints of an arm that one loop on one bus cannot command."""
+def require_buses(configs: Sequence[Config]) -> None:
+    """`ConfigurationError` for joints of an arm that one loop cannot command."""
     first = configs[0]
-    if first.bus.interface not in CYCLIC_INTERFACES:
-        raise ConfigurationError(
-            f"{first.path}: bus.interface (={first.bus.interface}) must be one of {', '.join(CYCLIC_INTERFACES)} "
-            "for an arm"
-        )
-    for config in configs[1:]:
-        place, wanted = (config.bus.interface, config.bus.channel), (first.bus.interface, first.bus.channel)
-        if place != wanted:
+    for config in configs:
+        if config.bus.interface not in CYCLIC_INTERFACES:
             raise ConfigurationError(
-                f"{config.path}: bus (={':'.join(place)}) must be {':'.join(wanted)}, that of {first.path.name}: the "
-                "joints of an arm are on one bus"
+                f"{config.path}: bus.interface (={config.bus.interface}) must be one of "
+                f"{', '.join(CYCLIC_INTERFACES)} for an arm"
             )
+    for config in configs[1:]:
         for key in ("heartbeat_s", "master_node"):
             value, of_first = getattr(canopen_section(config), key), getattr(canopen_section(first), key)
             if value != of_first:

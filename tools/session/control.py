@@ -7,12 +7,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock, no_longer_starting
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
@@ -41,6 +41,7 @@ class StopSignals:
         self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
         self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
         self._again = False  # the next signal is no new one
+        self._command = threading.Lock()
 
     @property
     def request(self) -> StopRequest:
@@ -76,8 +77,11 @@ class StopSignals:
         return timer
 
     def on_stop_command(self) -> None:
-        """`jointctl stop` has come; in another thread than the run."""
-        self.commanded_ns = time.monotonic_ns()
+        """`jointctl stop` has come; in another thread than the run, of an arm by the lock of each of its buses."""
+        with self._command:
+            if self.commanded_ns:
+                return
+            self.commanded_ns = time.monotonic_ns()
         self.name = STOP_COMMAND
         self.on_command(self.request)
         self._wake()  # from whatever the run waits for
@@ -143,9 +147,9 @@ def _nothing_lost(signals: StopSignals) -> Iterator[None]:
 
 
 # --- A program's control of a joint, from before anything is sent to the drive until the program ends ---
-# It holds the lock of the bus, collects the user's stops, and passes `jointctl stop` on to whatever it is doing.  One
-# for each verb that moves a joint or changes its drive, around all that it does: a stop between two motions counts
-# too.
+# It holds the lock of the bus, of an arm those of all its buses, collects the user's stops, and passes `jointctl stop`
+# on to whatever it is doing.  One for each verb that moves a joint or changes its drive, around all that it does: a
+# stop between two motions counts too.
 
 
 FILES_S = 4.0  # for log and messages, after the drive is off
@@ -153,10 +157,10 @@ FILES_S = 4.0  # for log and messages, after the drive is off
 
 @dataclass(frozen=True)
 class Control:
-    """`signals` raise KeyboardInterrupt except while the joint may have torque; `marker_fd` is for child processes."""
+    """`signals` raise KeyboardInterrupt except while the joint may have torque; child processes get `marker_fds`."""
 
     signals: StopSignals
-    marker_fd: int | None = None
+    marker_fds: tuple[int, ...] = ()
 
 
 def stop_within_s(config: Config) -> float:
@@ -166,30 +170,46 @@ def stop_within_s(config: Config) -> float:
 
 
 @contextmanager
-def in_control(config: Config, output: Output) -> Iterator[Control]:
-    """`BusError` names the program that has the bus."""
-    with control_of(config.bus.interface, config.bus.channel, output, stop_within_s(config)) as control:
+def in_control(config: Config, output: Output, others: Sequence[Config] = ()) -> Iterator[Control]:
+    """`BusError` names the program that has the bus; `others`: joints of an arm besides."""
+    joints = (config, *others)
+    with stop_signals(raising=True) as signals, _locked(_places(joints), output, _within_s(joints), signals) as control:
         yield control
 
 
 @contextmanager
-def in_program(config: Config, output: Output) -> Iterator[Control]:
+def in_program(config: Config, output: Output, others: Sequence[Config] = ()) -> Iterator[Control]:
     """As `in_control`, for a run in another thread than the main one: Python's signals stay the program's own."""
-    bus, signals = config.bus, StopSignals(wake=lambda: None)
-    with _locked(bus.interface, bus.channel, output, stop_within_s(config), signals) as control:
+    joints, signals = (config, *others), StopSignals(wake=lambda: None)
+    with _locked(_places(joints), output, _within_s(joints), signals) as control:
         yield control
+
+
+def _places(joints: Sequence[Config]) -> list[tuple[str, str]]:
+    """Interface and channel of each bus."""
+    return list(dict.fromkeys((config.bus.interface, config.bus.channel) for config in joints))
+
+
+def _within_s(joints: Sequence[Config]) -> float:
+    return max(stop_within_s(config) for config in joints)
 
 
 @contextmanager
 def control_of(interface: str, channel: str, output: Output, within_s: float = STOP_WITHIN_S) -> Iterator[Control]:
     """Of a bus; `within_s`: how long the program may take to end after `jointctl stop`."""
-    with stop_signals(raising=True) as signals, _locked(interface, channel, output, within_s, signals) as control:
+    places = [(interface, channel)]
+    with stop_signals(raising=True) as signals, _locked(places, output, within_s, signals) as control:
         yield control
 
 
 @contextmanager
-def _locked(interface: str, channel: str, output: Output, within_s: float, signals: StopSignals) -> Iterator[Control]:
-    with BusLock(interface, channel, signals.on_stop_command, within_s) as lock:
-        for remark in lock.remarks:
+def _locked(
+    places: Sequence[tuple[str, str]], output: Output, within_s: float, signals: StopSignals
+) -> Iterator[Control]:
+    """The locks of all buses: a stop by any of them is one of the whole program."""
+    with ExitStack() as stack:
+        locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
+        no_longer_starting()
+        for remark in (remark for lock in locks for remark in lock.remarks):
             output.warning(remark)
-        yield Control(signals, lock.marker_fd)
+        yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))

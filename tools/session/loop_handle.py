@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 from jointctl.tools.child_process import Starting
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.session.loop_memory import LoopOrder, new_block
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ class LoopHandle:
     """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
     `port`: record of the drive's exchange.  `tail_path`: where the loop itself saves the ring if this process has gone
-    when it ends.  `marker_fd` shows whose loop it is (`drivers.bus_lock`).
+    when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
     def __init__(
         self, config: Config, table: np.ndarray, port: type, tail_path: Path | None = None,
-        marker_fd: int | None = None, arm: ArmModel | None = None,
+        marker_fds: Sequence[int] = (), arm: ArmModel | None = None, joints: Sequence[Config] = (),
     ) -> None:  # fmt: skip
-        """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model."""
+        """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model and its `joints`, `config` the first."""
         self.block = new_block(table, port, arm)
         self._tail = 0
         self.lost_records = 0
@@ -64,10 +64,14 @@ class LoopHandle:
             cpu=config.loop.cpu,
             priority=config.loop.priority,
             tail_path=None if tail_path is None else str(tail_path.absolute()),
+            more_buses=tuple(
+                (axis, joints[axis].bus.interface, joints[axis].bus.channel)
+                for axis in sorted(set(first_on_bus(joints)) - {0})
+            ),
         )
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "jointctl.tools.session.loop_process", order.argument()],
-            pass_fds=(self.block.fd,) if marker_fd is None else (self.block.fd, marker_fd),
+            pass_fds=(self.block.fd, *marker_fds),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keys that a terminal turns into signals are not for the loop
         )

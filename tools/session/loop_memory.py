@@ -152,6 +152,7 @@ class LoopOrder:
     tail_path: str | None = None  # where the ring is saved if the supervisor has gone
     axes: int = 1
     links: int = 0  # of an arm whose model is in the block
+    more_buses: tuple[tuple[int, str, str], ...] = ()  # of an arm: axis of the first drive on it, interface, channel
 
     def argument(self) -> str:
         return json.dumps(asdict(self))

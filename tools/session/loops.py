@@ -81,22 +81,28 @@ def compiled_call(block: SharedBlock, period_ns: int, receive_ns: int) -> Callab
 
 @contextmanager
 def compiled_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
-    """The compiled loop, warm and attached to the bus."""
+    """The compiled loop, warm and attached to the bus, or to the buses of an arm."""
     from jointctl.drivers.can.frames import FRAME_BYTES
     from jointctl.drivers.can.open import open_cyclic_end
 
     call = compiled_call(block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
-    with open_cyclic_end(order.interface, order.channel) as end:
+    with contextlib.ExitStack() as stack:
+        ends = {
+            axis: stack.enter_context(open_cyclic_end(interface, channel))
+            for axis, interface, channel in ((0, order.interface, order.channel), *order.more_buses)
+        }
 
         def go() -> None:
-            block.port[0].fd = end.fileno()
+            for axis, end in ends.items():
+                block.port[axis].fd = end.fileno()
             call(FOREVER)
 
         def flush() -> None:
-            with contextlib.suppress(OSError):  # nothing waits, or the bus is down: the loop will tell
-                while end.recv(FRAME_BYTES, socket.MSG_DONTWAIT):
-                    pass
+            for end in ends.values():
+                with contextlib.suppress(OSError):  # nothing waits, or the bus is down: the loop will tell
+                    while end.recv(FRAME_BYTES, socket.MSG_DONTWAIT):
+                        pass
 
         yield ReadyLoop(go, flush)
 

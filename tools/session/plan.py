@@ -97,6 +97,11 @@ class RunPlan:
         return self.arm.joints if self.arm is not None else (JointPlan(self.config, self.motion, self.log_path),)
 
     @property
+    def configs(self) -> tuple[Config, ...]:
+        """Of the joints."""
+        return tuple(joint.config for joint in self.joints)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the joints of an arm; ("",) of one that is alone."""
         return tuple(joint.name for joint in self.joints)

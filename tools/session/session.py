@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,12 +16,13 @@ from typing import Any, TypeVar
 from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
 from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
+from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault, StopRequest
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
-from jointctl.tools.recording.run_summary import KeptRecords, summarise
+from jointctl.tools.recording.run_summary import KeptRecords, TimeSummary, histogram_times, summarise
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
@@ -33,6 +34,7 @@ from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import (
     Around,
     BusWatch,
+    FrameRecorder,
     RunParts,
     RunWatch,
     TemperatureWatch,
@@ -43,7 +45,20 @@ from jointctl.tools.session.session_drive import Guard, session_drive
 from jointctl.tools.session.set_points import SetPointSources
 
 POLL_S = 0.02
+SYNC_SPREAD_us = 100.0  # of the buses of an arm: what is longer is a warning
 Answer = TypeVar("Answer")
+
+
+def spread_text(spread: TimeSummary | None) -> tuple[int, str, str] | None:
+    """Level, source and text of how far the SYNCs of the buses were apart; None on one bus."""
+    if spread is None:
+        return None
+    level = INFO if spread.max_us <= SYNC_SPREAD_us else WARNING
+    return (
+        level,
+        "bus",
+        (f"SYNC of all buses within {spread.p99_us:.0f} us in 99 % of the cycles, {spread.max_us:.0f} us at most"),
+    )
 
 
 def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
@@ -87,8 +102,7 @@ class Session:
         with (
             signals.held(),
             self._loop(tail_path) as loop,
-            recording(config) as recorder,
-            bus_watch(config) as bus_news,
+            self._buses() as looking_on,
             self._kind.kept_awake(self._output),
         ):
             self.loop = loop
@@ -109,7 +123,8 @@ class Session:
                 signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
-                return self._supervise(drives, loop, reports, placed, Around(signals, bus_news, recorder, guard))
+                around = {axis: Around(signals, *watchers, guard) for axis, watchers in looking_on.items()}
+                return self._supervise(drives, loop, reports, placed, around)
             except (BusError, DeviceError, NoDeviceError):
                 if signals.commanded_ns:  # the frames of that stop look like another controller's
                     raise KeyboardInterrupt from None
@@ -125,13 +140,24 @@ class Session:
 
     def _loop(self, tail_path: Path) -> LoopHandle:
         """The loop process, started; it waits for its word."""
-        plan, port, marker_fd = self.plan, loop_of(self._config.drive.kind)[0], self._control.marker_fd
+        plan, port, marker_fds = self.plan, loop_of(self._config.drive.kind)[0], self._control.marker_fds
         model = None if plan.arm is None else plan.arm.config.model
-        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, model)
+        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fds, model, plan.configs)
+
+    @contextlib.contextmanager
+    def _buses(self) -> Iterator[dict[int, tuple[BusWatch, FrameRecorder | None]]]:
+        """Who looks on at each bus, by the number of the first joint on it."""
+        with contextlib.ExitStack() as stack:
+            found: dict[int, tuple[BusWatch, FrameRecorder | None]] = {}
+            for axis in sorted(set(first_on_bus(self.plan.configs))):
+                config = self._joints[axis].config
+                recorder = stack.enter_context(recording(config))
+                found[axis] = stack.enter_context(bus_watch(config)), recorder
+            yield found
 
     def _opened(self) -> DriveGroup:
         """The drives of all joints, nothing sent to them yet."""
-        return self._kind.open_all([joint.config for joint in self._joints], self.signals.leave_if_asked)
+        return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked)
 
     def _made_safe(self, drives: DriveGroup) -> str:
         states = drives.make_safe(asked=bool(self.signals.commanded_ns))
@@ -179,7 +205,7 @@ class Session:
 
     def _supervise(
         self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
-        around: Around,
+        around: Mapping[int, Around],
     ) -> RunResult:  # fmt: skip
         plan = self.plan
         if plan.arm is None:
@@ -200,8 +226,9 @@ class Session:
                 log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
                 kept = stack.enter_context(KeptRecords(joint.log_path.parent))
                 shown: Display = JointDisplay(display, joint.name, orders, axis) if joint.name else display
-                # frames and troubles of the bus belong to no joint: they are in the first one's log
-                own = around if axis == 0 else replace(around, bus_watch=BusWatch(joint.config, None), recorder=None)
+                # frames and troubles of a bus belong to no joint: they are in the log of the first one on it
+                no_bus = replace(around[0], bus_watch=BusWatch(joint.config, None), recorder=None)
+                own = around.get(axis, no_bus)
                 points, together = (self._set_points, None) if axis == 0 else (None, watches[0].log)
                 parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, points, together)
                 watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
@@ -233,7 +260,8 @@ class Session:
             state = self._made_safe(drives)
             for each in watches:
                 each.take_records(last=True)
-            watch.tell_bus_news()
+            for each in watches:
+                each.tell_bus_news()
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
@@ -254,17 +282,26 @@ class Session:
             with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
         state = self._made_safe(drives)
-        recorder = watch.around.recorder
-        if recorder is not None:
-            recorder.end()
+        for each in watches:
+            if each.around.recorder is not None:
+                each.around.recorder.end()
         for each in watches:
             each.take_records(last=True)
-        watch.tell_bus_news()  # it often explains the fault that has ended the run
+            each.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
-        if recorder is not None and recorder.dropped:
-            watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
-        bus_load = self._kind.bits_sent(loop.block.port) / (self._config.bus.bitrate_bitps * elapsed_s)
-        results = [self._result(*each, state, bus_load) for each in zip(watches, reports, strict=True)]
+        for each in watches:
+            if each.around.recorder is not None and each.around.recorder.dropped:
+                dropped = each.around.recorder.dropped
+                each.log.write_event(WARNING, "log", f"{dropped} CAN frames were not recorded: too slow")
+        if (spread := spread_text(histogram_times(loop.block.histograms[Histogram.SYNC_SPREAD]))) is not None:
+            watch.log.write_event(*spread)
+        loads = [
+            self._kind.bits_sent(loop.block.port, axis) / (joint.config.bus.bitrate_bitps * elapsed_s)
+            for axis, joint in enumerate(self._joints)
+        ]
+        results = [
+            self._result(each, report, state, load) for each, report, load in zip(watches, reports, loads, strict=True)
+        ]
         return replace(results[0], others=tuple(results[1:]))
 
     @staticmethod

@@ -91,8 +91,8 @@ class SessionDrive(ABC):
         """Whether the status word alone tells of a fault."""
         return False
 
-    def bits_sent(self, ports: Any) -> float:
-        """On bus or line in this run, `ports` the records of the exchange of all joints."""
+    def bits_sent(self, ports: Any, axis: int = 0) -> float:
+        """On the joint's bus or line in this run, `ports` the records of the exchange of all joints."""
         return float(ports[0].bits_sent)
 
     @abstractmethod

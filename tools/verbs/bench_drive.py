@@ -204,9 +204,15 @@ def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[list[Stop
         return [stop_target(path, given)], []
     targets: list[StopTarget] = []
     problems: list[ConfigurationError] = []
+    buses: dict[tuple[str, str], int] = {}
     for name in joints:
+        file, its_given = path.parent / str(name), given
+        if given is not None and given.channel is not None:
+            section = readable_keys(file).section("bus")
+            place = str(section.get("interface")), str(section.get("channel"))
+            its_given = given.of_bus(buses.setdefault(place, len(buses)))
         try:
-            targets.append(stop_target(path.parent / str(name), given))
+            targets.append(stop_target(file, its_given))
         except ConfigurationError as error:
             problems.append(error)
     if not targets:

@@ -114,10 +114,10 @@ class CanopenBench(BenchDrive):
         return serve_can(config, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
 
     def serve_arm(self, arm: ArmConfig, output: Output, options: ServeOptions) -> int:
-        from jointctl.tools.session.canopen_drive import require_one_bus
+        from jointctl.tools.session.canopen_drive import require_buses
         from jointctl.tools.verbs.hil import serve_can
 
-        require_one_bus(arm.joints)
+        require_buses(arm.joints)
         return serve_can(arm, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
 
 

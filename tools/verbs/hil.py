@@ -91,7 +91,7 @@ def serve_can(
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
-    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.configuration.config import Config, first_on_bus
     from jointctl.tools.session.control import stop_signals
     from jointctl.tools.session.loop_process import slow_start
     from jointctl.tools.virtual_joint import serve_virtual_joint
@@ -105,15 +105,20 @@ def serve_can(
     ):
         started()
         make_realtime(config, output)
-        bus = config.bus
-        place = f"{bus.interface}:{bus.channel}"
-        if bus.interface == "jointctl":
-            place += f" ({default_socket_path(bus.channel)})"
-        nodes = [str(canopen_section(each).node) for each in joints]
-        which = f"virtual joint: node {nodes[0]}" if len(nodes) == 1 else f"virtual arm: nodes {', '.join(nodes)}"
-        output.note(f"{which} on {place}; Ctrl-C ends it")
-        if bus.interface == "jointctl":
-            output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
+        buses = first_on_bus(joints)
+        parts = []
+        for axis in sorted(set(buses)):
+            bus = joints[axis].bus
+            place = f"{bus.interface}:{bus.channel}"
+            if bus.interface == "jointctl":
+                place += f" ({default_socket_path(bus.channel)})"
+            own = [str(canopen_section(each).node) for each, its in zip(joints, buses, strict=True) if its == axis]
+            parts.append(f"{'node' if len(own) == 1 else 'nodes'} {', '.join(own)} on {place}")
+        output.note(f"virtual {'joint' if len(joints) == 1 else 'arm'}: {'; '.join(parts)}; Ctrl-C ends it")
+        for axis in sorted(set(buses)):
+            bus = joints[axis].bus
+            if bus.interface == "jointctl":
+                output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
         with watched(given, live, output, joint.plant_states):
             wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
     return 0

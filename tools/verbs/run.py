@@ -74,12 +74,11 @@ def tracked(
     if not (assume_yes or dry_run):
         require_terminal()
     plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
-    first = plan.config
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
         _displays(plan, output, run_title(config), scope) as display,
         remote(live, config, output) as others,
-        in_control(first, output) as control,
+        in_control(plan.config, output, plan.configs[1:]) as control,
     ):
         session = Session(
             plan, others.consent(consent, output), output, control, others.beside(display), others.set_points

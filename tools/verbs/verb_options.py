@@ -150,12 +150,29 @@ def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config
 
 
 def arm_on_bus(arm: ArmConfig, given: GivenPlace) -> ArmConfig:
-    """The arm with all its joints where the command line says; `UsageError` for what is one joint's alone."""
+    """The arm with its joints where the command line says, see `GivenPlace.of_bus`.
+
+    `UsageError` for what is one joint's alone, and for one channel where there are several buses that are not virtual.
+    """
+    from jointctl.tools.configuration.arm import bus_problems
+    from jointctl.tools.configuration.config import first_on_bus, raise_if
     from jointctl.tools.configuration.load import moved
 
     if given.node is not None:
         raise UsageError(f"--target (={given.node}) is one joint's, and {arm.path} is an arm", "give the joint's file")
-    return replace(arm, joints=tuple(moved(joint, given) for joint in arm.joints))
+    buses = first_on_bus(arm.joints)
+    numbers = sorted(set(buses))
+    joints = tuple(
+        moved(joint, given.of_bus(numbers.index(bus))) for joint, bus in zip(arm.joints, buses, strict=True)
+    )  # fmt: skip
+    real = [joint.path for joint in joints if joint.bus.interface != "jointctl"]
+    if given.channel is not None and len(numbers) > 1 and real:
+        raise UsageError(
+            f"--channel (={given.channel}) names one bus, and the joints of {arm.path} are on {len(numbers)}",
+            "bus.channel in the joints' files names them",
+        )
+    raise_if([f"{arm.path}: {line}" for line in bus_problems(arm.arm, joints)])
+    return replace(arm, joints=joints)
 
 
 # --- What the command line makes of an option besides ---

@@ -63,7 +63,19 @@ def test_a_bus_that_is_too_slow_is_refused_with_the_rate_that_fits(arm: ArmConfi
     words = "bus virtual0: 3 joints (joint0, joint1, joint2) need 1030 bits a cycle, 103.0% of the bus"
     assert words in str(caught.value)
     assert caught.value.hint.startswith("500 Hz fits")
+    assert "they fit on 2 buses, as 2 + 1 joints" in caught.value.hint
     require_budgets(of(arm, *[at_rate(with_second, 500.0)] * 3))
+
+
+@pytest.mark.parametrize(
+    ("count", "rate_Hz", "hint"),
+    [(7, 1000.0, "on 3 buses, as 3 + 3 + 1 joints"),
+     (4, 2000.0, "on 4 buses, "), (2, 4000.0, "one of them alone is too much for a bus")],
+)  # fmt: skip
+def test_so_many_buses_as_are_needed_are_named(arm: ArmConfig, count: int, rate_Hz: float, hint: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        require_budgets(of(arm, *[at_rate(arm.joints[0], rate_Hz)] * count))
+    assert hint in caught.value.hint
 
 
 def test_joints_on_two_buses_share_neither(arm: ArmConfig) -> None:

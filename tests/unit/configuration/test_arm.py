@@ -148,7 +148,6 @@ IN_URDF: list[tuple[str, str, str]] = [
         'lower="-120"',
         "joint elbow: limit lower (='-120') must be within 12.57",
     ),
-    (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 90 0"', "joint wrist: rpy (='0 90 0') must be within 12.57; degrees"),
     (r'ixx="0.004" ixy="0" ixz="0.001"', 'ixx="0.4" ixy="0" ixz="0"', "link forearm: the principal moments"),
     (r'iyy="0.028"', 'iyy="28000"', "link forearm: iyy (='28000') must be within 240; kg mm2"),
     (r'<parent link="forearm"/>', '<parent link="hand"/>', "joint wrist is in a loop"),
@@ -162,6 +161,15 @@ IN_URDF: list[tuple[str, str, str]] = [
     (r'name="wrist" type="revolute"', 'name="wrist" type="prismatic"', "joint wrist (=prismatic) must be revolute"),
     (r'name="wrist"', 'name="hand_turn"', "arm.joint_names: wrist must be a joint of arm.urdf that moves by itself"),
     (r"<robot", "<!DOCTYPE robot><robot", "must have no DOCTYPE"),
+    (r'lower="-2.1"', 'lower="2.2"', "joint elbow: limit lower (=2.2) must be below upper (=2.1)"),
+    (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 10 0"', "joint wrist: rpy (='0 10 0') must be within 6.284; degrees"),
+    (r'<link name="hand">', '<link name="forearm"/><link name="hand">', "link forearm is there 2 times"),
+    (
+        r"</robot>",
+        '<link name="a"/>' + "".join(f'<link name="l{i}"/>' for i in range(9)) + "</robot>",
+        "here: base, a, l0, l1, l2 and 6 more",
+    ),
+    (r"</robot>", "".join(f'<link name="l{i}"/>' for i in range(1000)) + "</robot>", "elements link, at most 1000"),
     (r"</robot>", "", "not valid XML"),
     (
         r'velocity="3.5" effort="80"',
@@ -175,6 +183,13 @@ IN_URDF: list[tuple[str, str, str]] = [
 def test_a_urdf_that_cannot_be(folder: Path, pattern: str, text: str, words: str) -> None:
     change(folder / "arm.urdf", pattern, text)
     assert words in problem(folder)
+
+
+def test_entities_are_refused_in_whatever_encoding_the_file_is(folder: Path) -> None:
+    bomb = '<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>'
+    for encoding in ("utf-8", "utf-16"):
+        (folder / "arm.urdf").write_bytes(bomb.encode(encoding))
+        assert "must have no DOCTYPE and no entities" in problem(folder)
 
 
 IN_FILES: list[tuple[str, str, str, str]] = [

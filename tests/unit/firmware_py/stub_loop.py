@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Word, run_loop
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Histogram, Word, run_loop
 from jointctl.firmware_py.kernel import exported, record_array_type
 from jointctl.firmware_py.libc import monotonic_ns, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
@@ -80,7 +80,7 @@ class Loop:
         self.state, self.sample, self.command = new(AxisState), new(Sample), new(Command)
         reset_axis(constants[0], self.state[0])
         self.words, self.ring = np.zeros(WORDS, np.int64), new(LogRecord, ring)
-        self.histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+        self.histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
         self.stub = np.zeros(STUB_WORDS, np.int64)
         self.stub[BUSY_CYCLE] = self.stub[STOP_CYCLE] = -1
         self.period_ns = period_ns

@@ -15,7 +15,17 @@ import pytest
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.firmware_py.axis import MOVES_AGAIN, _brake
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, Clock, CycleMemory, Exchange, Slot, Word, step_cycle
+from jointctl.firmware_py.cycle import (
+    HISTOGRAM_BINS,
+    WORDS,
+    Clock,
+    CycleMemory,
+    Exchange,
+    Histogram,
+    Slot,
+    Word,
+    step_cycle,
+)
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
@@ -43,7 +53,7 @@ class Arm:
             reset_axis(self.constants[axis], self.state[axis])
         self.memory = CycleMemory(
             self.constants, self.state, np.zeros((2, 1, 5)), new(Sample, 2), new(Command, 2), np.zeros(WORDS, np.int64),
-            new(LogRecord, RING), np.zeros((3, HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
+            new(LogRecord, RING), np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
         )  # fmt: skip
         self.slept_ns = 0
         self.now_ns = 0
@@ -104,8 +114,17 @@ def test_two_axes_run_in_one_cycle_and_both_are_logged() -> None:
     newest = [memory.ring[record % RING] for record in (598, 599)]
     assert [int(record.time_ns) for record in newest] == [arm.now_ns] * 2
     assert [int(record.cycle) for record in newest] == [300, 300]
-    assert list(memory.histograms.sum(axis=1)) == [300, 600, 300]  # of each axis a round trip
+    assert list(memory.histograms.sum(axis=1)) == [300, 600, 300, 0]  # of each axis a round trip
     assert memory.histograms[1, 1] == 600
+
+
+def test_a_bus_that_gets_its_sync_later_is_counted_and_its_samples_taken_as_of_then() -> None:
+    arm = Arm().run(100)
+    arm.memory.sample[1].sync_late_ns = 7_300
+    arm.run(20)
+    assert list(arm.memory.histograms[Histogram.SYNC_SPREAD].nonzero()[0]) == [7]
+    assert arm.memory.histograms[Histogram.SYNC_SPREAD, 7] == 20
+    assert list(arm.state.sample_late_s) == [0.0, pytest.approx(7.3e-6)]
 
 
 def test_the_motion_of_one_axis_is_over_the_others_brake_with_it_and_the_loop_ends_with_the_last() -> None:

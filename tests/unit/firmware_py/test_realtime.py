@@ -146,7 +146,7 @@ def test_histograms_count_every_cycle_once(loop: Callable[..., Loop]) -> None:
     [(-5, 0), (0, 0), (999, 0), (1000, 1), (4_095_999, 4095), (4_096_000, 4096), (10**15, 4096)],
 )
 def test_bins(duration_ns: int, bin_us: int) -> None:
-    histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+    histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
     count(histograms, Histogram.WORK, duration_ns)
     assert histograms[Histogram.WORK, bin_us] == 1
     assert histograms.sum() == 1

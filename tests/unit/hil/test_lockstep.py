@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Word
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
@@ -49,7 +49,7 @@ class Lockstep:
         device, self.words = self.device, np.zeros(WORDS, np.int64)
         memory = CycleMemory(
             self.constants, self.state, np.zeros((1, 1, 5)), self.sample, self.command, self.words, self.log,
-            np.zeros((3, HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
+            np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
         )  # fmt: skip
         world = World(
             device.device, device.plant_constants, device.plant_state, new(FrameQueue), no_faults(),

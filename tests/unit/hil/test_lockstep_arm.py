@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+from jointctl.hil.canopen.records import PowerState
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
+from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 from tests.bench.arm_study import KINDS, SPEEDS, random_arm, rmse_mrad
 from tests.bench.arm_study import run as run_study
@@ -48,6 +54,39 @@ def test_all_joints_begin_and_end_together(whole: list[LockstepRun]) -> None:
 def test_no_joint_has_torque_before_all_may(whole: list[LockstepRun]) -> None:
     for one in whole:
         assert not one.log.command_torque_Nm[one.log.phase < AxisPhase.APPROACH].any()
+
+
+def on_two_buses(arm: ArmConfig) -> ArmConfig:
+    """The wrist alone on a second one, with the shoulder's node."""
+    *others, wrist = arm.joints
+    bus = wrist.bus.model_copy(update={"channel": "virtual1"})
+    drive = wrist.drive.model_copy(update={"node": 1})
+    return replace(arm, joints=(*others, wrist.model_copy(update={"bus": bus, "drive": drive})))
+
+
+@pytest.mark.parametrize(("faulty", "lost"), [(0, {"shoulder", "elbow"}), (2, {"wrist"})])
+def test_a_bus_that_is_lost_stops_the_joints_of_both(arm: LockstepArm, faulty: int, lost: set[str]) -> None:
+    given = on_two_buses(arm.arm)
+    joints, constants = LockstepArm(given), arm.constants()
+    fault = new(FaultConstants)
+    fault[0].kind, fault[0].start_s, fault[0].duration_s = FaultKind.BUS_OFF, 3.0, 1e6
+    plants = joints.plant_constants, joints.plant_state
+    runs = joints.run_with_faults(fault, faulty, constants, plants, arm_plant_of(given), longest_s=12.0, tail_s=1.0)
+    first = [int(np.argmax(run.log.fault != 0)) if run.log.fault.any() else 1 << 30 for run in runs]
+    blamed = {name for name, row in zip(given.names, first, strict=True) if row == min(first)}
+    assert blamed == lost
+    assert {runs[axis].fault for axis in range(3) if given.names[axis] in lost} == {Fault.STALE_SAMPLE}
+    began = [int(np.argmax(run.log.phase >= AxisPhase.RAMPING)) for run in runs]
+    assert max(began) - min(began) <= 1
+    for run in runs:
+        assert run.state.phase == AxisPhase.FINISHED
+        assert run.truth[-1, TRUE_POWER_STATE] != PowerState.OPERATION_ENABLED
+        assert abs(run.truth[-1, TRUE_VELOCITY_radps]) < 1e-3
+
+
+def test_its_twin_on_two_buses_the_arm_moves_as_on_one(arm: LockstepArm, whole: list[LockstepRun]) -> None:
+    for one, other in zip(whole, run(LockstepArm(on_two_buses(arm.arm))), strict=True):
+        assert np.array_equal(one.log.position_rad, other.log.position_rad)
 
 
 def test_gravity_helps_every_joint_and_the_whole_model_the_quick_ones_more() -> None:

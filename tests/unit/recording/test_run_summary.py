@@ -127,7 +127,7 @@ def test_the_rows_of_the_histograms_are_those_of_the_loop() -> None:
 
 
 def test_deadlines_from_histograms() -> None:
-    histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+    histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
     histograms[Histogram.WAKE, 10] = 989
     histograms[Histogram.WAKE, 20] = 10
     histograms[Histogram.WAKE, 500] = 1

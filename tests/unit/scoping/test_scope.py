@@ -20,7 +20,7 @@ import pytest
 from jointctl.drivers.bus_lock import STARTING, is_marked
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED, DataError, MotionFault, UsageError
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Word
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, StopRequest
@@ -151,7 +151,7 @@ def test_deadline_statistics_leave_out_cycles_without_a_sample() -> None:
 
 # --- The scope's feed: nothing waits for a page, and the run knows who watches ---
 def snapshot(rows: Any) -> Snapshot:
-    return Snapshot(rows[-1], 0, np.zeros((3, HISTOGRAM_BINS), np.int64), 1.0, True, rows)
+    return Snapshot(rows[-1], 0, np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), 1.0, True, rows)
 
 
 @pytest.fixture
@@ -599,7 +599,7 @@ def test_a_motion_without_an_end_says_so(
         constants=axis,
         state=new(AxisState),
         words=np.zeros(max(Word) + 1),
-        histograms=np.zeros((3, HISTOGRAM_BINS), np.int64),
+        histograms=np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64),
     )
     sink: Any = SimpleNamespace(path=tmp_path, append=lambda records: None, write_records=lambda records: None)
     display: Any = SimpleNamespace(show=shown.append, event=lambda event: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,17 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, UsageError
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
-from jointctl.tools.session.canopen_drive import require_one_bus
+from jointctl.tools.session.canopen_drive import require_buses
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import blamed, resolve_arm
+from jointctl.tools.verbs.bench_drive import stop_targets
+from jointctl.tools.verbs.verb_options import arm_on_bus
 
 NAMES = ["shoulder", "elbow", "wrist"]
 
@@ -57,20 +61,60 @@ def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("bus", "channel", "other"), "must be jointctl:virtual0"), (("drive", "heartbeat_s", 0.3), "must be 0.2"),
+        (("bus", "interface", "slcan"), "must be one of socketcan, jointctl"),
+        (("drive", "heartbeat_s", 0.3), "must be 0.2"),
         (("drive", "master_node", 99), "one heartbeat for all joints"),
     ],
 )  # fmt: skip
 def test_joints_that_one_loop_cannot_command_are_refused(arm: ArmConfig, change: Any, words: str) -> None:
     section, key, value = change
     joints = list(arm.joints)
-    require_one_bus(joints)
+    require_buses(joints)
     joints[2] = joints[2].model_copy(
         update={section: getattr(joints[2], section).model_copy(update={key: value})}
     )  # fmt: skip
     with pytest.raises(ConfigurationError, match=words) as caught:
-        require_one_bus(joints)
+        require_buses(joints)
     assert "wrist.toml" in str(caught.value)
+
+
+@pytest.fixture
+def on_two_buses(tmp_path: Path) -> Path:
+    """The shipped arm, its wrist on a bus of its own with the shoulder's node."""
+    shutil.copytree(SHIPPED_ARM.parent, tmp_path / "arm")
+    wrist = tmp_path / "arm" / "wrist.toml"
+    wrist.write_text(re.sub(r"(?m)^node = 3", "node = 1", wrist.read_text().replace("virtual0", "virtual1")))
+    return tmp_path / "arm" / "arm.toml"
+
+
+def test_a_channel_that_is_given_is_that_of_the_first_virtual_bus(on_two_buses: Path) -> None:
+    given = GivenPlace("jointctl", "mine")
+    arm = arm_on_bus(load_arm(on_two_buses), given)
+    assert [joint.bus.channel for joint in arm.joints] == ["mine", "mine", "mine.2"]
+    targets, unread = stop_targets(on_two_buses, given)
+    assert [target.place for target in targets] == [(joint.bus.interface, joint.bus.channel) for joint in arm.joints]
+    assert not unread
+    targets, _ = stop_targets(on_two_buses)
+    assert [target.place[1] for target in targets] == ["virtual0", "virtual0", "virtual1"]
+
+
+def test_one_channel_is_refused_where_the_buses_are_real(on_two_buses: Path) -> None:
+    with pytest.raises(UsageError, match=r"--channel \(=can0\) names one bus, and the joints of .* are on 2"):
+        arm_on_bus(load_arm(on_two_buses), GivenPlace("socketcan", "can0"))
+    arm = arm_on_bus(load_arm(on_two_buses), GivenPlace("socketcan"))
+    assert [(joint.bus.interface, joint.bus.channel) for joint in arm.joints][1:] == [
+        ("socketcan", "virtual0"), ("socketcan", "virtual1"),
+    ]  # fmt: skip
+
+
+def test_two_buses_become_one_by_the_environment_only_with_different_nodes(
+    on_two_buses: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAN_CHANNEL", "shared")
+    with pytest.raises(
+        ConfigurationError, match=r"wrist.toml: drive.node \(=1\) must differ from drive.node of shoulder"
+    ):
+        arm_on_bus(load_arm(on_two_buses), GivenPlace())
 
 
 @pytest.mark.parametrize("cycles", [0, 1, 7, RING_RECORDS // 3 - 1, RING_RECORDS // 3 + 5, RING_RECORDS])

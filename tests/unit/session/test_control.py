@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.bus_lock import BusLock, lock_name
+from jointctl.drivers.bus_lock import BusLock, lock_name, wait_for_answers
+from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
 from jointctl.tools.session import control, stop_call
@@ -26,6 +27,7 @@ from jointctl.tools.session.control import (
     StopSignals,
     control_of,
     in_control,
+    in_program,
     stop_signals,
     stop_within_s,
 )
@@ -113,11 +115,31 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
     monkeypatch.setattr(control, "BusLock", Lock)
     held = in_control(virtual_config, Output()) if configured else control_of("virtual", "x", Output(), 3.0)
     with held as ours:
-        assert ours.marker_fd is not None
+        assert len(ours.marker_fds) == 1
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
     assert times_s == [stop_within_s(virtual_config) if configured else 3.0]
     assert "a remark" in capsys.readouterr().err
+
+
+def test_an_arm_has_the_locks_of_all_its_buses_and_a_stop_by_any_is_one_stop(virtual_config: Any) -> None:
+    def on(channel: str) -> Any:
+        bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": f"{channel}-{os.getpid()}"})
+        return virtual_config.model_copy(update={"bus": bus})
+
+    joints = [on("a"), on("b"), on("a")]
+    with in_program(joints[0], Output(), joints[1:]) as ours:
+        assert len(ours.marker_fds) == 2
+        for config in joints[:2]:
+            with pytest.raises(BusError, match="another program controls"):
+                BusLock(config.bus.interface, config.bus.channel)
+        first_ns = 0
+        for config in joints[1::-1]:
+            with StopCall(config.bus.interface, config.bus.channel) as call:
+                wait_for_answers(call._holders)
+            assert ours.signals.request is StopRequest.QUICK_STOP
+            first_ns = first_ns or ours.signals.commanded_ns
+        assert ours.signals.commanded_ns == first_ns
 
 
 # --- Stop signals that come where an exception does not get through ---

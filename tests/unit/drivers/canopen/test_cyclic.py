@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import socket
@@ -502,6 +503,70 @@ def test_its_twin_a_drive_that_does_not_answer_costs_the_window_and_not_the_othe
 def test_a_drive_that_ignores_a_stop_costs_both_the_heartbeat(two_drives: TwoDrives, deaf: int) -> None:
     two_drives.ports[deaf].ignored_cycles = IGNORED_MAX_CYCLES + 1
     assert two_drives.cycle(30.0, 0, 1)[1] == [0x80, 0x205, 0x206]
+
+
+class TwoBuses(TwoDrives):
+    """The second drive, with the node of the first, on a bus of its own."""
+
+    def __init__(self, wire: Wire, ours: list[socket.socket], buses: list[socket.socket]) -> None:
+        super().__init__(wire, ours[0], buses[0])
+        self.buses = buses
+        self.ports.bus[:] = (0, 1)
+        self.ports.fd[:] = [end.fileno() for end in ours]
+        for name in ("tpdo_id", "rpdo_id", "emergency_id", "heartbeat_id"):
+            self.ports[name] = self.ports[name][0]
+
+    def both(self, window_s: float, *answering: int) -> list[list[int]]:
+        """What each bus got in a cycle in which these drives answer."""
+        for number in answering:  # before it: it counts as the answer, since none has come so far
+            self.buses[number].send(struct.pack("<IB3xHih", 0x185, 8, 0x0250, 100 * (number + 1), 0))
+        now_ns = time.monotonic_ns()
+        exchange.receive(self.link, self.samples, np.int64(now_ns), np.int64(now_ns + window_s * 1e9))
+        exchange.send(self.link, self.samples, self.commands)
+        found: list[list[int]] = []
+        for bus in self.buses:
+            found.append([])
+            with contextlib.suppress(OSError):
+                while frame := bus.recv(16, socket.MSG_DONTWAIT):
+                    found[-1].append(struct.unpack_from("<I", frame)[0])
+        return found
+
+
+@pytest.fixture
+def two_buses(wire: Wire) -> Iterator[TwoBuses]:
+    with contextlib.ExitStack() as stack:
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
+        for end in (end for pair in pairs for end in pair):
+            stack.enter_context(end)
+        yield TwoBuses(wire, [ours for _, ours in pairs], [bus for bus, _ in pairs])
+
+
+def test_each_bus_gets_its_sync_and_heartbeat_and_the_answers_of_one_are_no_others(two_buses: TwoBuses) -> None:
+    assert two_buses.both(0.01, 0, 1) == [[0x80, 0x77F, 0x205]] * 2
+    assert list(two_buses.samples["count"]) == [1, 1]
+    assert list(two_buses.samples["position_rad"] / RAD_PER_COUNT) == pytest.approx([100.0, 200.0])
+    assert two_buses.samples[0].sync_late_ns == 0
+    assert 0 < two_buses.samples[1].sync_late_ns < 1_000_000_000
+
+
+@pytest.mark.parametrize("silent", [0, 1])
+def test_a_silent_bus_costs_the_other_none_of_its_samples(two_buses: TwoBuses, silent: int) -> None:
+    assert two_buses.both(0.01, 1 - silent) == [[0x80, 0x77F, 0x205]] * 2
+    assert list(two_buses.samples["count"]) == [silent, 1 - silent]
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_bus_that_has_gone_is_an_error_of_its_own_drives(two_buses: TwoBuses, lost: int) -> None:
+    two_buses.buses[lost].close()
+    two_buses.buses[lost] = two_buses.buses[1 - lost]
+    two_buses.both(0.01, 1 - lost)
+    assert two_buses.samples[1 - lost].bus_errors == 0
+    assert two_buses.samples[lost].bus_errors == 3  # SYNC, heartbeat, RPDO
+
+
+def test_a_drive_that_ignores_a_stop_costs_every_bus_the_heartbeat(two_buses: TwoBuses) -> None:
+    two_buses.ports[1].ignored_cycles = IGNORED_MAX_CYCLES + 1
+    assert two_buses.both(0.01, 0, 1) == [[0x80, 0x205]] * 2
 
 
 @pytest.mark.parametrize(
