@@ -42,7 +42,7 @@ class CanopenSession(SessionDrive):
 
             check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
-    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None, private: bool = False) -> Drive:
         from jointctl.drivers.can.open import open_python_can
         from jointctl.drivers.canopen.drive import CanopenDrive
 
@@ -51,16 +51,19 @@ class CanopenSession(SessionDrive):
             return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps)
 
         reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
-        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
+        private = private and config.bus.interface == "jointctl"  # a bus of metal is never ours alone
+        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate, private=private)
 
-    def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+    def open_all(
+        self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None, private: bool = False
+    ) -> DriveGroup:
         """See `SessionDrive`; all drives share one end of the bus."""
         from jointctl.drivers.canopen.drive import CanopenDrive
 
         if len(configs) == 1:
-            return DriveGroup([self.open(configs[0], gate)])
+            return DriveGroup([self.open(configs[0], gate, private)])
         require_one_bus(configs)
-        first = self.open(configs[0], gate)
+        first = self.open(configs[0], gate, private)
         assert isinstance(first, CanopenDrive)
         try:
             others = [CanopenDrive(first, canopen_settings(config), gate=gate) for config in configs[1:]]
