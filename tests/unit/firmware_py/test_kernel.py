@@ -16,6 +16,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numba.core import caching
@@ -69,6 +70,7 @@ def test_a_cache_that_takes_nothing_more_does_not_cost_the_run(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(*of, full)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # nothing of an earlier run
     monkeypatch.setattr(Kernel, "_cache_path", lambda *_: tmp_path / "twice.entry")
 
     @kernel
