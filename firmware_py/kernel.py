@@ -18,19 +18,23 @@ With ``NUMBA_DISABLE_JIT=1`` the same functions run as plain Python (coverage an
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
+import inspect
 import os
 import platform
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from jointctl.firmware_py import machine_code
+
 if TYPE_CHECKING:
-    import numpy as np
-    from numba.core.typing.templates import Signature
+    from types import ModuleType
 
 # In `tools` only these sources may hold kernels (a test sees to it), so that editing a verb does not recompile.
 TOOLS_WITH_KERNELS = ("identification/**/*.py", "wake_up.py")
@@ -84,203 +88,141 @@ def prepare_cache() -> Path | None:
 
 
 cache_folder = prepare_cache()
-
-import llvmlite.binding as llvm  # noqa: E402
-import numba  # noqa: E402  (NUMBA_CACHE_DIR is read while numba is imported)
-from numba.core import caching, codegen, event, types  # noqa: E402
-from numba.core.registry import CPUDispatcher  # noqa: E402
-from numba.extending import register_jitable  # noqa: E402
-
-_numba_config: Any = numba.config
-if cache_folder is not None:
-    _numba_config.CACHE_DIR = str(cache_folder)
-
-JIT_DISABLED = bool(_numba_config.DISABLE_JIT)
-
-
-_cache_file: Any = caching.IndexDataCacheFile
-_save_compiled = _cache_file.save
-
-
-def _save_where_there_is_room(file: caching.IndexDataCacheFile, key: object, data: object) -> None:
-    """A disk that takes no more costs the next start some time, not this run."""
-    with contextlib.suppress(OSError):
-        _save_compiled(file, key, data)
-
-
-_cache_file.save = _save_where_there_is_room
-_load_index = _cache_file._load_index
-
-
-def _index_that_can_be_read(file: Path) -> Any:
-    """An index that is damaged, or names what this program cannot import, costs compiling, not the run."""
-    try:
-        return _load_index(file)
-    except Exception:
-        return {}
-
-
-_cache_file._load_index = _index_that_can_be_read
-
-
-def _no_blas() -> None:
-    raise ImportError("kernels have no linear algebra")
-
-
-# Numba looks for BLAS when the first function is loaded, that is it imports scipy.linalg: 0.2 s of every start.
-with contextlib.suppress(ImportError):
-    import numba.np.linalg as _numba_linalg
-
-    _numba_linalg.ensure_blas = _no_blas
-
-
-# Numba optimises every function together with all that it calls, and makes machine code of it: of a function ten calls
-# deep ten times.  The machine code is only needed where Python or C calls: what has no wrapper for them is kept as it
-# was lowered, and optimised with each function that has one.  Compiling takes half the time.
-_plain_library: Any = codegen.JITCodeLibrary
-_WRAPPERS = ("_ZN7cpython", "_ZN5cfunc")  # how numba's names of what Python and C call begin
-_ADDRESSES = "numba.dynamic.globals"
-
-
-class _Library(_plain_library):  # type: ignore[misc]
-    """What numba makes of one function; `_late` while it has no machine code, which comes when an address is asked."""
-
-    _late = False
-
-    def finalize(self) -> None:
-        self._late = not any(function.name.startswith(_WRAPPERS) for function in self._final_module.functions)
-        super().finalize()
-
-    def _optimize_final_module(self) -> None:
-        # an address of this process keeps a function out of the cache: optimising tells whether it is used
-        if any(variable.name.startswith(_ADDRESSES) for variable in self._final_module.global_variables):
-            self._late = False
-        if not self._late:
-            super()._optimize_final_module()
-
-    def _finalize_final_module(self) -> None:
-        if not self._late:
-            super()._finalize_final_module()
-            return
-        self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        self._ensure_finalized()
-        if self._late and any(function.name == name for function in self.get_defined_functions()):
-            self._late = False
-            self._optimize_final_module()
-            self._finalize_final_module()
-        return int(super().get_pointer_to_function(name))
-
-    def serialize_using_object_code(self) -> tuple[str, str, object]:
-        if self._late:
-            return (self.name, "late", self._final_module.as_bitcode())
-        serialized: tuple[str, str, object] = super().serialize_using_object_code()
-        return serialized
-
-    @classmethod
-    def _unserialize(cls, owner: Any, state: tuple[str, str, Any]) -> Any:
-        name, kind, data = state
-        if kind != "late":
-            return super()._unserialize(owner, state)
-        library = owner.create_library(name)
-        library._final_module = llvm.parse_bitcode(data)
-        library._late = True
-        library._finalize_final_module()
-        return library
-
-
-_jit: Any = codegen.JITCPUCodegen
-_jit._library_class = _Library
-_set_env = _jit.set_env
-
-
-def _set_env_of_machine_code(owner: Any, name: str, env: object) -> None:
-    """Only machine code has a place for numba's environment of a function, which no kernel uses."""
-    if owner._engine.is_symbol_defined(name):
-        _set_env(owner, name, env)
-
-
-_jit.set_env = _set_env_of_machine_code
-
-
-# The name of a record's type, with all its fields, is worked out some fifty thousand times: 7 % of compiling.
-_record_type: Any = types.Record
-_name_of_record = _record_type.__repr__
-
-
-def _name_that_is_kept(record: Any) -> str:
-    names: dict[str, str] = vars(record)
-    if "_name_kept" not in names:
-        names["_name_kept"] = _name_of_record(record)
-    return names["_name_kept"]
-
-
-_record_type.__repr__ = _name_that_is_kept
-
-_NO_COUNTS: dict[str, Any] = {"_nrt": False, "cache": cache_folder is not None}
-_MACHINE: dict[str, Any] = {"_nrt": False, "nogil": True, "error_model": "numpy"}
-_OPTIONS: dict[str, Any] = {**_NO_COUNTS, **_MACHINE}
+JIT_DISABLED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-
-# A kernel that kernels call needs none of the code that takes arguments over from Python: a quarter of the time that
-# compiling takes.  So each has a twin without it, which is all that other kernels see.
-_ONLY_CALLED_BY_KERNELS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-
-
-class _InnerCache(caching.FunctionCache):
-    """Beside the kernel's own entries in the same files."""
-
-    def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
-        base: Any = super()
-        return (*base._index_key(sig, codegen), "inner")
+_lock = threading.RLock()
+_shared: list[Callable[..., Any]] = []
+_told: list[Callable[[], object]] = []  # when something is compiled
+_compiler_module: ModuleType | None = None
 
 
-class _Kernel(CPUDispatcher):
-    """As numba makes it; `inner` is its twin."""
+def _compiler() -> Any:
+    """Numba, which takes half a second to load."""
+    global _compiler_module
+    if _compiler_module is None:
+        from jointctl.firmware_py import compiler
 
-    inner: Any
+        _compiler_module = compiler
+        for function in _shared:
+            compiler.share(function)
+    return _compiler_module
+
+
+@functools.cache
+def _options() -> str:
+    return machine_code.options()
+
+
+class Kernel:
+    """A function that is compiled when Python calls it, unless the cache has its machine code.
+
+    Other kernels see numba's own dispatcher for it.
+    """
+
+    def __init__(self, function: Callable[..., Any], *, forceinline: bool = False) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self._forceinline = forceinline
+        self._dispatchers: dict[bool, Any] = {}
+        self._entries: dict[tuple[Any, ...], machine_code.Entry] = {}
+
+    __name__: str
+    __qualname__: str
+
+    def __reduce__(self) -> str:
+        return self.__qualname__
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        numbers: list[Any] = []
+        form: list[Any] = []
+        for each in arguments:
+            machine_code.flatten(each, numbers, form)
+        entry = self._entries.get(tuple(form)) if not named else None
+        if entry is None:
+            bound = inspect.signature(self.py_func).bind(*arguments, **named)
+            bound.apply_defaults()
+            if len(bound.args) != len(arguments):
+                return self(*bound.args)
+            entry = self._entry(tuple(form), arguments)
+        return entry(numbers)
+
+    def _entry(self, form: tuple[Any, ...], arguments: tuple[Any, ...]) -> machine_code.Entry:
+        with _lock:
+            if form not in self._entries:
+                code, path = None, self._cache_path(arguments)
+                if path is not None:
+                    code = machine_code.read(path)
+                if code is None:
+                    for tell in _told:
+                        tell()
+                    code = _compiler().compiled(self, arguments)
+                    if path is not None:
+                        with contextlib.suppress(OSError):  # a disk that takes no more costs the next start some time
+                            machine_code.write(path, code)
+                address = machine_code.link(code, lambda: _compiler().load_helpers())
+                self._entries[form] = machine_code.Entry(self.__qualname__, code, address)
+            return self._entries[form]
+
+    def _cache_path(self, arguments: tuple[Any, ...]) -> Path | None:
+        if cache_folder is None or self.py_func.__closure__:
+            return None
+        words = "\n".join((_options(), self.entry_name, *map(machine_code.form_name, arguments)))
+        return cache_folder / f"{self.__name__}-{hashlib.sha256(words.encode()).hexdigest()[:24]}.entry"
+
+    @functools.cached_property
+    def entry_name(self) -> str:
+        """The same in all processes; of a kernel that is not in our sources, another one when its file is changed."""
+        function = self.py_func
+        name = f"{function.__module__}.{function.__qualname__}"
+        if function.__module__.startswith(_OURS):
+            return name
+        with contextlib.suppress(OSError):
+            stat = os.stat(function.__code__.co_filename)
+            return f"{name}@{function.__code__.co_firstlineno}-{stat.st_mtime_ns}-{stat.st_size}"
+        return f"{name}@{os.getpid()}-{id(function)}"
+
+    def dispatcher_for(self, with_kernels: bool = False) -> Any:
+        """Numba's; `with_kernels`: to be called with kernels, under whose types nothing can be kept in its cache."""
+        with _lock:
+            if with_kernels not in self._dispatchers:
+                keep = cache_folder is not None and not with_kernels
+                made = _compiler().dispatcher_of(self.py_func, cache=keep, forceinline=self._forceinline)
+                self._dispatchers[with_kernels] = made
+            return self._dispatchers[with_kernels]
+
+    @property
+    def loaded(self) -> int:
+        """For how many forms of arguments it was loaded or compiled, for Python."""
+        return len(self._entries)
 
     @property
     def _numba_type_(self) -> Any:
-        return types.Dispatcher(self.inner)
+        return _compiler().type_of_kernel(self.dispatcher_for())
 
 
-def _compiled(function: Callable[..., Any], **more: bool) -> Any:
-    compiler: Any = numba.njit
-    made = compiler(**_OPTIONS, **more)(function)
-    if JIT_DISABLED:
-        return made
-    made.__class__ = _Kernel
-    made.inner = compiler(**_OPTIONS, **more, **_ONLY_CALLED_BY_KERNELS)(function)
-    if cache_folder is not None:
-        cache: Any = _InnerCache
-        made.inner._cache = cache(function)
-    return made
+_OURS = ("jointctl.firmware_py.", "jointctl.drivers.", "jointctl.hil.", "jointctl.tools.")
 
 
 def kernel(function: Function) -> Function:
     """Compile `function` for the control loop (nogil, cached, no allocation, no exceptions from arithmetic)."""
-    return cast(Function, _compiled(function))
+    return function if JIT_DISABLED else cast(Function, Kernel(function))
+
+
+def inlined(function: Function) -> Function:
+    """Compile a function whose machine code is copied into its callers: what it returns stays in registers."""
+    return function if JIT_DISABLED else cast(Function, Kernel(function, forceinline=True))
 
 
 @contextlib.contextmanager
 def on_compiling(tell: Callable[[], object]) -> Iterator[None]:
     """`tell` is called when a kernel is compiled inside, for each; not for those that come from the cache."""
-
-    class Listener(event.Listener):
-        def on_start(self, event: object) -> None:
-            tell()
-
-        def on_end(self, event: object) -> None:
-            """Of no interest."""
-
-    with event.install_listener("numba:compile", Listener()):
+    _told.append(tell)
+    try:
         yield
+    finally:
+        _told.remove(tell)
 
 
 def plain(function: Function) -> Function:
@@ -288,40 +230,39 @@ def plain(function: Function) -> Function:
     return cast(Function, getattr(function, "py_func", function))
 
 
-def inlined(function: Function) -> Function:
-    """Compile a function whose machine code is copied into its callers: what it returns stays in registers."""
-    return cast(Function, _compiled(function, forceinline=True))
-
-
 def shared(function: Function) -> Function:
     """Compile `function` into its compiled callers, and leave it plain Python for callers in Python.
 
-    For what takes functions as arguments: C functions or kernels from the one, Python functions from the other.
+    For what takes functions as arguments: kernels from the one, Python functions from the other.
     """
-    return register_jitable(**_MACHINE, forceinline=True)(function)
+    if not JIT_DISABLED:
+        _shared.append(function)
+        if _compiler_module is not None:
+            _compiler_module.share(function)
+    return function
 
 
-def exported(signature: Signature) -> Callable[[Function], Any]:
-    """Compile to a C function of a fixed signature, which a kernel may take as an argument and still be cached.
+class Exchanging(Kernel):
+    """A kernel that is handed to kernels, and runs as plain Python where Python calls it."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.py_func(*arguments, **named)
+
+
+def exported(function: Function) -> Function:
+    """Compile a function that other kernels are given as an argument.
 
     This is how the loop (which may not import a driver) calls the driver it was given.
     """
-
-    def wrap(function: Function) -> Any:
-        if JIT_DISABLED:
-            return function
-        compile_c: Any = numba.cfunc
-        return compile_c(signature, nopython=True, **_NO_COUNTS)(function)
-
-    return wrap
+    return function if JIT_DISABLED else cast(Function, Exchanging(function))
 
 
-def record_array_type(dtype: np.dtype) -> Any:
-    """The numba type of a one-dimensional array of records, for `exported` signatures."""
-    return types.Array(numba.from_dtype(dtype), 1, "C")
+class OnlyInKernels:
+    """Something of numba's that kernels use by a global name, and Python does not: made when one is compiled."""
 
+    def __init__(self, make: Callable[[Any], Any]) -> None:
+        self._make = make
 
-def memory_type(cls: type, *members: Any) -> Any:
-    """The numba type of a NamedTuple of one-dimensional arrays with these dtypes, for `exported` signatures."""
-    named_tuple: Any = types.NamedTuple
-    return named_tuple([types.Array(numba.from_dtype(one), 1, "C") for one in members], cls)
+    @functools.cached_property
+    def _numba_type_(self) -> Any:
+        return self._make(_compiler())

@@ -9,46 +9,33 @@ from __future__ import annotations
 
 import ctypes
 import errno as errno_codes
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numba.core import types
-from numba.extending import intrinsic
 
-from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
+from jointctl.firmware_py.kernel import JIT_DISABLED, OnlyInKernels, kernel
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numba.core.base import BaseContext
-    from numba.core.typing.context import BaseContext as BaseTypingContext
-    from numba.core.typing.templates import Signature
-
-_CTYPES = {
-    types.int32: ctypes.c_int32,
-    types.int64: ctypes.c_int64,
-    types.uintp: ctypes.c_size_t,
-    types.intp: ctypes.c_ssize_t,
-}
+_CTYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uintp": ctypes.c_size_t, "intp": ctypes.c_ssize_t}
 
 
-def external(name: str, result: types.Type, *arguments: Any) -> Any:
+def external(name: str, result: str, *arguments: str) -> Any:
+    """A function of the C library; types by numba's names, as in `_CTYPES`."""
     if not JIT_DISABLED:
-        return types.ExternalFunction(name, result(*arguments))
+        return OnlyInKernels(lambda compiler: compiler.type_of_external(name, result, arguments))
     function = getattr(ctypes.CDLL(None, use_errno=False), name)
     function.restype = _CTYPES[result]
     function.argtypes = [_CTYPES[argument] for argument in arguments]
     return function
 
 
-clock_nanosleep = external("clock_nanosleep", types.int32, types.int32, types.int32, types.uintp, types.uintp)
-clock_gettime = external("clock_gettime", types.int32, types.int32, types.uintp)
-send = external("send", types.intp, types.int32, types.uintp, types.uintp, types.int32)
-recv = external("recv", types.intp, types.int32, types.uintp, types.uintp, types.int32)
-ppoll = external("ppoll", types.int32, types.uintp, types.uintp, types.uintp, types.uintp)
-accept4 = external("accept4", types.int32, types.int32, types.uintp, types.uintp, types.int32)
-close = external("close", types.int32, types.int32)
-_errno_location = external("__errno_location", types.uintp)
+clock_nanosleep = external("clock_nanosleep", "int32", "int32", "int32", "uintp", "uintp")
+clock_gettime = external("clock_gettime", "int32", "int32", "uintp")
+send = external("send", "intp", "int32", "uintp", "uintp", "int32")
+recv = external("recv", "intp", "int32", "uintp", "uintp", "int32")
+ppoll = external("ppoll", "int32", "uintp", "uintp", "uintp", "uintp")
+accept4 = external("accept4", "int32", "int32", "uintp", "uintp", "int32")
+close = external("close", "int32", "int32")
+_errno_location = external("__errno_location", "uintp")
 
 CLOCK_MONOTONIC = 1
 CLOCK_BOOTTIME = 7
@@ -79,45 +66,16 @@ if JIT_DISABLED:
         words[index] = value
 
 else:
-    from llvmlite import ir
 
-    @intrinsic
-    def _load_int32(typing_context: BaseTypingContext, address: types.Integer) -> Any:
-        def generate(
-            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-        ) -> Any:
-            pointer = builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
-            return builder.load(pointer)
+    def _intrinsic(name: str) -> Any:
+        def made(compiler: Any) -> Any:
+            from jointctl.firmware_py import intrinsics
 
-        return types.int32(types.uintp), generate
+            return compiler.type_of_intrinsic(getattr(intrinsics, name))
 
-    @intrinsic
-    def load_acquire(typing_context: BaseTypingContext, words: types.Array, index: types.Integer) -> Any:
-        """Read a shared int64 word so that nothing after it is moved before it (a plain read is hoisted)."""
+        return OnlyInKernels(made)
 
-        def generate(
-            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-        ) -> Any:
-            array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
-            pointer = builder.gep(array.data, [arguments[1]])
-            return builder.load_atomic(pointer, "acquire", 8)
-
-        return types.int64(words, types.int64), generate
-
-    @intrinsic
-    def store_release(
-        typing_context: BaseTypingContext, words: types.Array, index: types.Integer, value: types.Integer
-    ) -> Any:
-        """Write a shared int64 word so that nothing before it is moved after it."""
-
-        def generate(
-            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-        ) -> Any:
-            array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
-            pointer = builder.gep(array.data, [arguments[1]])
-            builder.store_atomic(arguments[2], pointer, "release", 8)
-
-        return types.void(words, types.int64, types.int64), generate
+    _load_int32, load_acquire, store_release = map(_intrinsic, ("load_int32", "load_acquire", "store_release"))
 
 
 @kernel

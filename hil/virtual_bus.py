@@ -28,7 +28,6 @@ from types import TracebackType
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numba.core import types
 
 from jointctl.firmware_py import libc
 from jointctl.firmware_py.kernel import kernel
@@ -82,10 +81,10 @@ _SOL_SOCKET, _SO_SNDBUF = int(socket.SOL_SOCKET), int(socket.SO_SNDBUF)
 _CLIENT_BUFFER_BYTES = 1 << 20  # the kernel limits it to net.core.wmem_max
 _SO_TIMESTAMPNS = 35  # the system notes when a frame was sent; it is read with the frame
 _CLOCK_REALTIME = 0  # of that note
-_setsockopt = libc.external("setsockopt", types.int32, types.int32, types.int32, types.int32, types.uintp, types.uintp)
+_setsockopt = libc.external("setsockopt", "int32", "int32", "int32", "int32", "uintp", "uintp")
 
 
-_recvmsg = libc.external("recvmsg", types.intp, types.int32, types.uintp, types.int32)
+_recvmsg = libc.external("recvmsg", "intp", "int32", "uintp", "int32")
 # words of the scratch: the clock's two, `struct msghdr`, `struct iovec`, and a control message of header and timespec
 _MESSAGE, _VECTOR, _CONTROL, SCRATCH_WORDS = 2, 9, 11, 19
 _CONTROL_BYTES = 64

@@ -145,7 +145,7 @@ class LiveMotor:
             self._session = Session(plan, self._approval, output, control, display, others.set_points)
             if own is not None:
                 own.until_bus()
-                self._session.until_ready = own.until_ready
+                self._session.until_ready, self._session.private_bus = own.until_ready, True
             self._thread = threading.Thread(target=self._run, name="jointctl session")
             self._thread.start()
             for name in _NEEDED:  # commissioning waits for the drive most of the time

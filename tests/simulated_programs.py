@@ -485,7 +485,9 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
     def new_network(_: Any, __: Any, *listeners: can.Listener) -> SimulatedNetwork:
         return SimulatedNetwork(world, listeners)
 
-    def open_simulated(_: Any, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+    def open_simulated(
+        _: Any, configs: Sequence[Config], gate: Callable[[], None] = lambda: None, private: bool = False
+    ) -> DriveGroup:
         bus: Any = None
         drives: list[CanopenDrive] = []
         for config in configs:

@@ -57,8 +57,9 @@ class CanopenDrive:
     listens for other controllers there, and the heartbeat.  Their `commission`, `start_cyclic` and `close` are called
     by `drivers.drive.DriveGroup`.
 
-    It listens for other controllers from its making on.  `gate` is called between any two steps before the loop runs,
-    and raises once the user has asked for a stop: no step follows then but those of `make_safe`.
+    It listens for other controllers from its making on; `private`: see `OtherControllers`.  `gate` is called between
+    any two steps before the loop runs, and raises once the user has asked for a stop: no step follows then but those of
+    `make_safe`.
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
     `make_safe` opens it again.  In between no one but the loop talks to the drive; it is disabled until the loop
     enables it, and from the loop's first heartbeat on its own watchdog stops it when the loop ends.
@@ -72,6 +73,7 @@ class CanopenDrive:
         reopen: Callable[[], can.BusABC] | None = None,
         gate: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
+        private: bool = False,
     ) -> None:
         self._settings = settings
         self._sleep, self._gate, self._clock = sleep, gate, clock
@@ -94,7 +96,7 @@ class CanopenDrive:
             self._others.add_nodes(nodes)
             self._arm.append(self)
         else:
-            self._others = OtherControllers(nodes, settings.master_node, clock)
+            self._others = OtherControllers(nodes, settings.master_node, clock, private)
             self._network = new_network(bus, sleep, self._others)
             report_own_frames(self._network, self._others)
             self._network.connect()

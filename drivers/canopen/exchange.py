@@ -10,7 +10,6 @@ import errno as errno_codes
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import types
 
 from jointctl.drivers.can.frames import FRAME_BYTES, Frame
 from jointctl.drivers.canopen.cyclic import (
@@ -28,12 +27,12 @@ from jointctl.drivers.canopen.cyclic import (
     note_wake,
 )
 from jointctl.drivers.drive import LOOK_LATE_NS
-from jointctl.firmware_py.kernel import exported, kernel, memory_type, record_array_type
+from jointctl.firmware_py.kernel import exported, kernel
 from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, monotonic_ns, wait_watched_ns, watch
 from jointctl.firmware_py.libc import recv as receive_bytes
 from jointctl.firmware_py.libc import send as send_bytes
-from jointctl.firmware_py.records import Command, Sample
-from jointctl.firmware_py.schema import INT32_MAX, dtype_of, new
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.schema import INT32_MAX, new
 
 # --- 16-byte CAN frames on a file descriptor, from inside the control loop ---
 # The same code serves an AF_CAN raw socket and an AF_UNIX SEQPACKET socket of the virtual bus: on both, one datagram
@@ -100,11 +99,6 @@ class CanopenLink(NamedTuple):
     port: Any  # CanopenPort[axes]
     frames: Any  # Frame[FRAME_SLOTS]
     scratch: np.ndarray  # int64[SCRATCH_WORDS or more]
-
-
-_SAMPLES = record_array_type(dtype_of(Sample))
-_COMMANDS = record_array_type(dtype_of(Command))
-_LINK = memory_type(CanopenLink, dtype_of(CanopenPort), dtype_of(Frame), np.dtype(np.int64))
 
 
 def link_of(port: Any) -> CanopenLink:
@@ -189,7 +183,7 @@ def _any_owed(ports: np.ndarray) -> bool:
     return False
 
 
-@exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
+@exported
 def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
     """Send SYNC and wait for the answering TPDO of each drive until `until_ns`; returns the time waited [ns].
 
@@ -222,7 +216,7 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
     return arrived_ns - started_ns
 
 
-@exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
+@exported
 def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
     """Send the RPDO of each drive; returns 0 or the last errno."""
     ports, failed = link.port, 0
@@ -241,7 +235,7 @@ def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
 # --- The same cycle for a caller that moves the frames itself (lockstep simulation) ---
 
 
-@exported(types.int64(_LINK))
+@exported
 def begin(link: CanopenLink) -> int:
     """`cyclic.begin_cycle`: so many frames are to be sent to every drive, from slot 0 on."""
     to_send = FRAME_SLOTS
@@ -250,13 +244,13 @@ def begin(link: CanopenLink) -> int:
     return to_send
 
 
-@exported(types.boolean(_LINK, types.int64, types.int64, _SAMPLES, types.int64))
+@exported
 def accept(link: CanopenLink, axis: int, slot: int, samples: np.ndarray, now_ns: int) -> bool:
     """`cyclic.accept_frame` of an axis on one slot of the frame memory."""
     return accept_frame(link.port[axis], link.frames[slot], samples[axis], now_ns)
 
 
-@exported(types.void(_LINK, types.int64, _SAMPLES, _COMMANDS))
+@exported
 def end(link: CanopenLink, axis: int, samples: np.ndarray, commands: np.ndarray) -> None:
     """`cyclic.end_cycle` of an axis: its RPDOs are in the slots SLOT_OFFSET (identifier 0: none) and SLOT_RPDO."""
     end_cycle(link.port[axis], link.frames, samples[axis], commands[axis])

@@ -46,12 +46,21 @@ class BusFailure(can.Listener):
 class OtherControllers(can.Listener):
     """Notices what only a controller sends: SYNC, NMT commands, SDO requests and RPDOs to `nodes`, our heartbeat.
 
-    It listens from its making on.  Some interfaces hand us the frames that we send ourselves: the first of them that
-    `sent` gets shows it, and from then on each counts once.
+    It listens from its making on, for LISTEN_S unless the bus is `private`: made a moment ago for this program alone,
+    in a process that it has started itself, with simulated drives.  There it names what comes, and waits for nothing.
+    Some interfaces hand us the frames that we send ourselves: the first of them that `sent` gets shows it, and from
+    then on each counts once.
     """
 
-    def __init__(self, nodes: Collection[int], master_node: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        nodes: Collection[int],
+        master_node: int,
+        clock: Callable[[], float] = time.monotonic,
+        private: bool = False,
+    ) -> None:
         self._clock = clock
+        self._wanted_s = 0.0 if private else LISTEN_S
         self._started_s = clock()
         self._nodes, self._master_node = frozenset(nodes), master_node
         self._rpdo_ids = {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
@@ -134,7 +143,7 @@ class OtherControllers(can.Listener):
     @property
     def to_listen_s(self) -> float:
         """How long it has still to listen until silence means something."""
-        return max(0.0, LISTEN_S - (self._clock() - self._started_s))
+        return max(0.0, self._wanted_s - (self._clock() - self._started_s))
 
     def add_rpdos(self, identifiers: Iterable[int]) -> None:
         """The RPDOs that the drive has by its own word; what has come of them counts."""

@@ -9,7 +9,6 @@ import errno as errno_codes
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import types
 
 from jointctl.drivers.drive import LOOK_LATE_NS
 from jointctl.drivers.elmo.cyclic import (
@@ -21,13 +20,12 @@ from jointctl.drivers.elmo.cyclic import (
     note_written,
     take_byte,
 )
-from jointctl.firmware_py.kernel import exported, kernel, memory_type, record_array_type
+from jointctl.firmware_py.kernel import exported, kernel
 from jointctl.firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
-from jointctl.firmware_py.records import Command, Sample
-from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.records import Sample
 
-_read = external("read", types.intp, types.int32, types.uintp, types.uintp)
-_write = external("write", types.intp, types.int32, types.uintp, types.uintp)
+_read = external("read", "intp", "int32", "uintp", "uintp")
+_write = external("write", "intp", "int32", "uintp", "uintp")
 
 
 class ElmoLink(NamedTuple):
@@ -37,10 +35,6 @@ class ElmoLink(NamedTuple):
     data: np.ndarray  # uint8[READ_MAX]
     scratch: np.ndarray  # int64[SCRATCH_WORDS]
 
-
-_SAMPLES = record_array_type(dtype_of(Sample))
-_COMMANDS = record_array_type(dtype_of(Command))
-_LINK = memory_type(ElmoLink, dtype_of(ElmoPort), np.dtype(np.uint8), np.dtype(np.int64))
 
 _GONE_EVENTS = 0x008 | 0x010 | 0x020  # POLLERR, POLLHUP, POLLNVAL
 _EIO = errno_codes.EIO
@@ -104,7 +98,7 @@ def _flush(port: ElmoPort, sample: Sample) -> int:
     return code
 
 
-@exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
+@exported
 def receive(link: ElmoLink, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
     """Ask for the position and wait for it until `until_ns`; returns the time waited [ns].
 
@@ -132,7 +126,7 @@ def receive(link: ElmoLink, samples: np.ndarray, now_ns: int, until_ns: int) -> 
     return arrived_ns - started_ns
 
 
-@exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
+@exported
 def send(link: ElmoLink, samples: np.ndarray, commands: np.ndarray) -> int:
     """Send torque or velocity and the slower questions; returns 0 or the errno."""
     port = link.port[0]

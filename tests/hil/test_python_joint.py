@@ -54,9 +54,9 @@ RAMPED = [AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING, AxisPhase.
 
 KERNELS = """
     import gc
-    from numba.core.dispatcher import Dispatcher
+    from jointctl.firmware_py.kernel import Kernel
     def kernels():
-        return {k.py_func.__qualname__ for k in gc.get_objects() if issubclass(type(k), Dispatcher) and k.overloads}
+        return {k.py_func.__qualname__ for k in gc.get_objects() if issubclass(type(k), Kernel) and k.loaded}
     at_first = kernels()
 """
 

@@ -168,7 +168,7 @@ def kernel_cache(folder: Path | None, cold: bool) -> Iterator[Finding]:
         return
     files = [path for path in folder.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)
-    warm = any(path.name.startswith("realtime.run_loop") and path.suffix == ".nbc" for path in files)
+    warm = any(path.name.startswith("run_loop-") and path.suffix == ".entry" for path in files)
     text = f"{folder}, {len(files)} files, {size / 1e6:.1f} MB, {'warm' if warm else 'cold'}"
     remedy = "" if warm else "the first start compiles for about a minute: run `jointctl demo` once"
     yield Finding(

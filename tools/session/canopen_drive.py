@@ -43,7 +43,7 @@ class CanopenSession(SessionDrive):
 
             check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
-    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None, private: bool = False) -> Drive:
         from jointctl.drivers.can.open import open_python_can
         from jointctl.drivers.canopen.drive import CanopenDrive
 
@@ -52,14 +52,17 @@ class CanopenSession(SessionDrive):
             return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps)
 
         reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
-        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
+        private = private and config.bus.interface == "jointctl"  # a bus of metal is never ours alone
+        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate, private=private)
 
-    def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+    def open_all(
+        self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None, private: bool = False
+    ) -> DriveGroup:
         """See `SessionDrive`; all drives of a bus share one end of it."""
         from jointctl.drivers.canopen.drive import CanopenDrive
 
         if len(configs) == 1:
-            return DriveGroup([self.open(configs[0], gate)])
+            return DriveGroup([self.open(configs[0], gate, private)])
         require_buses(configs)
         drives: list[CanopenDrive] = []
         buses = first_on_bus(configs)
@@ -68,7 +71,7 @@ class CanopenSession(SessionDrive):
                 if buses[axis] < axis:
                     drives.append(CanopenDrive(drives[buses[axis]], canopen_settings(config), gate=gate))
                     continue
-                first = self.open(config, gate)
+                first = self.open(config, gate, private)
                 assert isinstance(first, CanopenDrive)
                 stack.callback(first.close)
                 drives.append(first)

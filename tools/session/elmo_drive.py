@@ -39,7 +39,7 @@ class ElmoSession(SessionDrive):
     def check_rate(self, config: Config) -> None:
         serial_line_share(config)
 
-    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None, private: bool = False) -> Drive:
         return ElmoDrive(elmo_settings(config), gate=gate)
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:

@@ -91,6 +91,7 @@ class Session:
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
         self.loop: LoopHandle | None = None  # once it has been started
+        self.private_bus = False  # see `SessionDrive.open`
         # Waits for drives that are still starting, beside the loop and the listening; the argument may end it.
         self.until_ready: Callable[[Callable[[], None]], None] = lambda alive: None
 
@@ -157,7 +158,7 @@ class Session:
 
     def _opened(self) -> DriveGroup:
         """The drives of all joints, nothing sent to them yet."""
-        return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked)
+        return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked, self.private_bus)
 
     def _made_safe(self, drives: DriveGroup) -> str:
         states = drives.make_safe(asked=bool(self.signals.commanded_ns))

@@ -44,19 +44,23 @@ class SessionDrive(ABC):
         """`ConfigurationError` if bus or line do not carry the rate; before anything is opened."""
 
     @abstractmethod
-    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None, private: bool = False) -> Drive:
         """The drive of the configuration, its bus or port open; nothing has been sent to it.
+
+        `private`: on a virtual bus that was started a moment ago for this program alone.
 
         `gate` is called before each step until the loop runs, and raises where none may follow.  The caller holds the
         lock.
         """
 
-    def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+    def open_all(
+        self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None, private: bool = False
+    ) -> DriveGroup:
         """`open` for the joints of an arm, in their order; `ConfigurationError` where they cannot share a loop."""
         if len(configs) > 1:
             kind = configs[1].drive.kind
             raise ConfigurationError(f"{configs[1].path}: drive.kind (={kind}) must be canopen in an arm")
-        return DriveGroup([self.open(configs[0], gate)])
+        return DriveGroup([self.open(configs[0], gate, private)])
 
     @abstractmethod
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:

@@ -86,7 +86,7 @@ def tracked(
         if own is not None:
             load_check()  # the first kernel loads much of numba: while the bus is not there yet
             own.until_bus()
-            session.until_ready = own.until_ready
+            session.until_ready, session.private_bus = own.until_ready, True
         try:
             result = session.run()
         except KeyboardInterrupt:

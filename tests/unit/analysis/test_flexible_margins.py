@@ -7,13 +7,12 @@ import re
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.flexible_joint import Reading
-from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import LawConstants, LawState
@@ -36,7 +35,6 @@ from jointctl.tools.analysis.margins import (
 from jointctl.tools.configuration.config import Config
 from tests.configurations import changed, shipped
 
-JIT_DISABLED = bool(numba.config.DISABLE_JIT)
 PERIOD_s = 1e-3
 SUBSTEP_s = 50e-6 if JIT_DISABLED else 20e-6
 SUBSTEPS = round(PERIOD_s / SUBSTEP_s)

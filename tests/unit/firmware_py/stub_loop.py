@@ -6,13 +6,12 @@ import time
 from typing import Any
 
 import numpy as np
-from numba.core import types
 
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Histogram, Word, run_loop
-from jointctl.firmware_py.kernel import exported, record_array_type
+from jointctl.firmware_py.kernel import exported
 from jointctl.firmware_py.libc import monotonic_ns, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
-from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import DriveRequest, DriveState, FeedForward
 
@@ -30,12 +29,9 @@ STUB_WORDS = 10
 # Words of the stub drive, words of the loop, scratch; a plain tuple: compiled callers are cached under its type, which
 # a program that shares the cache must be able to load.
 StubLink = tuple[np.ndarray, np.ndarray, np.ndarray]
-_LINK = types.UniTuple(types.Array(types.int64, 1, "C"), 3)
-_SAMPLES = record_array_type(dtype_of(Sample))
-_COMMANDS = record_array_type(dtype_of(Command))
 
 
-@exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
+@exported
 def stub_receive(link: StubLink, samples: Any, now_ns: int, until_ns: int) -> int:
     """A drive that obeys at once; busy for a while in one cycle, writes the stop word in another."""
     stub = link[0]
@@ -56,7 +52,7 @@ def stub_receive(link: StubLink, samples: Any, now_ns: int, until_ns: int) -> in
     return np.int64(1500)  # type: ignore[return-value]
 
 
-@exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
+@exported
 def stub_send(link: StubLink, samples: Any, commands: Any) -> int:
     link[0][REQUEST] = commands[0].request
     link[0][SENT] += 1

@@ -8,18 +8,25 @@ import math
 import os
 import pickle
 import shutil
+import struct
 import subprocess
 import sys
 import time
+from enum import IntEnum
 from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numba.core import caching
 from numba.core.errors import NumbaError
 
+from jointctl.firmware_py import compiler, machine_code
 from jointctl.firmware_py import kernel as kernel_module
-from jointctl.firmware_py.kernel import kernel, source_hash
+from jointctl.firmware_py.kernel import Kernel, kernel, source_hash
+from jointctl.firmware_py.machine_code import MachineCode, Result
+from jointctl.firmware_py.schema import array_of, f8, i4, new, record
 from tests.places import ROOT
 from tests.python_process import run_python
 
@@ -47,22 +54,31 @@ def test_a_division_by_zero_does_not_unwind_the_loop() -> None:
 
 
 def test_options() -> None:
-    assert kernel_module._OPTIONS["nogil"] is True
-    assert kernel_module._OPTIONS["error_model"] == "numpy"
-    assert "fastmath" not in kernel_module._OPTIONS
+    assert compiler.OPTIONS["nogil"] is True
+    assert compiler.OPTIONS["error_model"] == "numpy"
+    assert "fastmath" not in compiler.OPTIONS
 
 
-def test_a_cache_that_takes_nothing_more_does_not_cost_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("of", [(caching.IndexDataCacheFile, "_save_index"), (machine_code, "write")])
+def test_a_cache_that_takes_nothing_more_does_not_cost_the_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, of: tuple[Any, str]
+) -> None:
+    refused = []
+
     def full(*_: object) -> None:
+        refused.append(1)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(caching.IndexDataCacheFile, "_save_index", full)
+    monkeypatch.setattr(*of, full)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # nothing of an earlier run
+    monkeypatch.setattr(Kernel, "_cache_path", lambda *_: tmp_path / "twice.entry")
 
     @kernel
     def twice(a: float) -> float:
         return 2.0 * a
 
     assert twice(3.0) == 6.0
+    assert refused
 
 
 def test_a_folder_that_cannot_be_written_is_no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +102,7 @@ def test_what_allocates_does_not_compile() -> None:
         allocating(3)
 
 
-# --- machine code is made where it is needed ---
+# --- machine code is made where it is needed, and loaded without the compiler ---
 ONE_KERNEL = """
 from jointctl.firmware_py.kernel import kernel
 
@@ -99,35 +115,197 @@ def called(a: float) -> float:
     return doubled(a) + 1.0
 """
 CALLS_IT = """
-import numba
+import sys
 from one_kernel import called, doubled
 
+print(called(3.0), called.loaded, doubled.loaded, "numba" in sys.modules)
+"""
+COMPILES_WITH_IT = """
+import numba
+from one_kernel import doubled
+
 again = numba.njit(lambda a: doubled(a) + 2.0)  # kept nowhere, so that it needs what it calls
-
-def made(which: object) -> list[object]:
-    return [*which.overloads.values()]
-
-def hits(which: object) -> int:
-    return sum(which.stats.cache_hits.values())
-
-print(called(3.0), again(3.0), doubled(3.0))
-print(made(called)[0].library._late, hits(called), hits(doubled.inner), hits(doubled))
-for compiled in made(doubled.inner):
+print(again(3.0))
+for compiled in doubled.dispatcher_for().overloads.values():
     library = compiled.library
     print(library._late, library.get_pointer_to_function(compiled.fndesc.mangled_name) > 0, library._late)
     print(library.get_pointer_to_function("not_there"))
+print(sum(doubled.dispatcher_for().stats.cache_hits.values()))
 """
 
 
 @pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
 def test_what_only_kernels_call_has_no_machine_code_and_comes_from_the_cache(tmp_path: Path) -> None:
     (tmp_path / "one_kernel.py").write_text(ONE_KERNEL)
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n" + CALLS_IT
-    cache = str(tmp_path / "cache")
-    first, second = (run_python(code, JOINTCTL_CACHE_DIR=cache).split() for _ in range(2))
-    assert first[:7] == ["7.0", "8.0", "6.0", "False", "0", "0", "0"]
-    assert second[:7] == ["7.0", "8.0", "6.0", "False", "1", "1", "1"]
-    assert first[7:] == second[7:] == ["True", "True", "False", "0"]
+
+    def run(code: str) -> list[str]:
+        begin = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        return run_python(begin + code, JOINTCTL_CACHE_DIR=str(tmp_path / "cache")).split()
+
+    assert run(CALLS_IT) == ["7.0", "1", "0", "True"]
+    assert run(CALLS_IT) == ["7.0", "1", "0", "False"]
+    assert run(COMPILES_WITH_IT) == ["8.0", "True", "True", "False", "0", "1"]
+    (tmp_path / "one_kernel.py").write_text(ONE_KERNEL.replace("2.0 * a", "4.0 * a"))
+    assert run(CALLS_IT) == ["13.0", "1", "0", "True"]  # never run stale
+
+
+class Colour(IntEnum):
+    RED = 1
+    BLUE = 2
+
+
+class Both(NamedTuple):
+    first: Any
+    second: Any
+
+
+@record
+class Inner:
+    a: i4
+    b: f8
+
+
+@record
+class Outer:
+    x: f8
+    inner: Inner
+    many: Annotated[np.ndarray, array_of(f8, 3)]
+
+
+@kernel
+def total(array: np.ndarray) -> float:
+    """Weighted by place, so that a wrong stride shows."""
+    result = 0.0
+    if array.ndim == 1:
+        for i in range(array.shape[0]):
+            result += (i + 1) * array[i]
+    return result
+
+
+@kernel
+def total2(array: np.ndarray) -> float:
+    result = 0.0
+    for i in range(array.shape[0]):
+        for k in range(array.shape[1]):
+            result += (10 * i + k + 1) * array[i, k]
+    return result
+
+
+GRID = np.arange(24.0).reshape(4, 6)
+
+
+@pytest.mark.parametrize(
+    "array", [np.arange(6.0), GRID[1], GRID[:, 2], GRID[::-1, 3], np.arange(5, dtype=np.int32), np.zeros(0)]
+)
+def test_an_array_of_any_layout_is_handed_over(array: np.ndarray) -> None:
+    assert total(array) == sum((i + 1) * float(value) for i, value in enumerate(array))
+
+
+@pytest.mark.parametrize("array", [GRID, GRID.T, GRID[::2, 1:4], GRID.T[1:3, ::2], np.asfortranarray(GRID), GRID[:0]])
+def test_one_of_two_dimensions_too(array: np.ndarray) -> None:
+    expected = sum((10 * i + k + 1) * float(array[i, k]) for i in range(array.shape[0]) for k in range(array.shape[1]))
+    assert total2(array) == expected
+
+
+@kernel
+def fill(outer: Outer, row: Any, value: float) -> None:
+    outer.x = value
+    outer.inner.a = 7
+    outer.many[1] = 2.0 * value
+    row.b = -value
+
+
+def test_records_and_arrays_are_written_where_they_are() -> None:
+    outers, inners = new(Outer, 3), new(Inner, 2)
+    fill(outers[2], inners[1], 1.5)
+    assert (outers[2].x, outers[2].inner.a, outers[2].many.tolist()) == (1.5, 7, [0.0, 3.0, 0.0])
+    assert inners[1].b == -1.5
+    assert not outers[:2].tobytes().strip(b"\0")
+    assert not inners[:1].tobytes().strip(b"\0")
+
+
+@kernel
+def echo(values: Any, flag: bool, number: int, colour: Any, small: Any) -> Any:
+    first = values.first
+    if values.second is None:
+        first = first + 1
+    return Both(first, (flag, number - 1)), small, colour == Colour.BLUE
+
+
+def test_numbers_truths_tuples_enums_and_none_come_and_go() -> None:
+    arguments = (Both(2, None), True, -(1 << 62), Colour.BLUE, np.uint8(255))
+    values = echo(*arguments)
+    assert values == (Both(3, (True, -(1 << 62) - 1)), 255, True)
+    assert type(values[0]) is Both
+    assert values[0][1][0] is True
+    assert echo(Both(2.5, 0.0), flag=False, number=1, colour=Colour.RED, small=np.int16(-3)) == (
+        Both(2.5, (False, 0)), -3, False,
+    )  # fmt: skip
+
+
+@kernel
+def colour_of(number: int) -> Any:
+    return Colour.RED if number == 1 else Colour.BLUE
+
+
+@kernel
+def with_default(a: float, b: float = 3.0) -> float:
+    return a * b
+
+
+@kernel
+def calls(function: Any, a: float) -> float:
+    return function(a, 2.0)
+
+
+@kernel
+def halved(a: float, b: float) -> float:
+    return a / b
+
+
+def test_an_enum_a_default_value_and_a_kernel() -> None:
+    assert colour_of(1) is Colour.RED
+    assert with_default(2.0) == 6.0
+    assert with_default(2.0, b=4.0) == with_default(b=4.0, a=2.0) == 8.0
+    assert calls(halved, 3.0) == 1.5
+    assert calls(divide, 3.0) == 1.5
+    with pytest.raises(TypeError):
+        with_default()
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
+def test_what_machine_code_cannot_be_given_is_refused() -> None:
+    with pytest.raises(TypeError, match="str"):
+        divide("a", 1.0)  # type: ignore[arg-type]
+    with pytest.raises(struct.error):
+        colour_of(1 << 63)
+
+
+def test_machine_code_that_is_not_as_it_was_written_is_not_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "x.entry"
+    code = MachineCode("symbol", "qd", Result("d"), b"object", alone=True)
+    machine_code.write(path, code)
+    assert machine_code.read(path) == code
+    assert [each.name for each in tmp_path.iterdir()] == ["x.entry"]
+    data = path.read_bytes()
+    for damaged in (b"", data[:40], data[:-1], data[:-1] + b"x", b"x" + data[1:]):
+        path.write_bytes(damaged)
+        assert machine_code.read(path) is None
+    assert machine_code.read(tmp_path / "none") is None
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
+def test_what_the_loop_and_the_virtual_joint_run_stands_alone() -> None:
+    """Nothing of it is left to be found in the compiler, which their processes do not load."""
+    assert kernel_module.cache_folder is not None
+    total(np.arange(3.0))
+    kept = [machine_code.read(path) for path in kernel_module.cache_folder.glob("*.entry")]
+    assert kept
+    assert all(code is not None and code.alone for code in kept)
+    code = next(code for code in kept if code is not None)
+    assert machine_code.unresolved(code.object_code) is not None
+    assert machine_code.unresolved(b"MZ") is None
+    assert not machine_code.stands_alone(b"MZ")
 
 
 # --- the cache must never run stale ---
@@ -233,7 +411,7 @@ def test_an_index_of_the_cache_that_cannot_be_read_costs_compiling_not_the_run(t
         Path(file._index_path).write_bytes(pickle.dumps(file._version) + index)
         return file.load("signature")
 
-    assert load(pickle.dumps((1, {}))) is None  # the twin
+    assert load(pickle.dumps((1, {}))) is None
     assert load(b"no pickle") is None
     assert load(pickle.dumps((1, {"x": StubOfATest})).replace(b"StubOfATest", b"NotThereNow")) is None
 

@@ -314,7 +314,7 @@ class TestCache:
         monkeypatch.setattr(health, "start_time_s", lambda cache: float(not started.append(cache)))
         (found,) = kernel_cache(tmp_path, False)
         assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
-        write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
+        write(tmp_path, "firmware_py_1/run_loop-0123456789ab.entry", "12345678")
         found, warm = kernel_cache(tmp_path, False)
         assert (found.status, found.numbers) == (OK, {"files": 1, "bytes": 8, "warm": True})
         assert (warm.topic, warm.numbers, started) == ("warm start", {"start_s": 1.0}, [None])
@@ -330,7 +330,7 @@ class TestCache:
             raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
 
         monkeypatch.setattr(health, "start_time_s", failing)
-        write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
+        write(tmp_path, "x/run_loop-0123456789ab.entry", "1")
         assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
 
     def test_the_probe_gets_the_other_cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,6 +45,24 @@ print(json.dumps(sorted(sys.modules)))
 """
 
 
+COMPILED = """
+import json, sys
+from jointctl.tools.session.loops import warm_up_compiled_loop
+warm_up_compiled_loop()
+print(json.dumps(sorted(sys.modules)))
+"""
+
+
+def test_a_loop_that_was_compiled_once_is_loaded_without_the_compiler() -> None:
+    command = [sys.executable, "-P", "-c", COMPILED]
+    for _ in range(2):
+        found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert "jointctl.firmware_py.realtime" in found
+    assert [
+        name for name in ("numba", "scipy", "pydantic", "can", "jointctl.firmware_py.compiler") if name in found
+    ] == []
+
+
 @pytest.mark.parametrize("program", [SUPERVISOR, LOOP], ids=["supervisor", "loop"])
 def test_a_canopen_run_on_hardware_loads_nothing_of_the_virtual_joint_and_of_elmo(tmp_path: Path, program: str) -> None:
     text = (CONFIGS / "virtual.toml").read_text().replace('"jointctl"', '"socketcan"', 1)

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import can
 import pytest
 
+from jointctl.drivers.can import open as open_module
+from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.network import FAILURE_PAUSE_S, LISTEN_S, BusFailure, OtherControllers
 from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.drive_section import GivenPlace
+from jointctl.tools.configuration.load import load_config, moved
+from jointctl.tools.session.canopen_drive import CanopenSession
+from tests.places import CONFIGS
 
 NODE, MASTER = 5, 126
 
@@ -125,6 +133,29 @@ def test_it_listens_for_a_second_from_its_making_on(passed_s: float, left_s: flo
     others = OtherControllers([NODE], MASTER, lambda: now[0])
     now[0] += passed_s
     assert others.to_listen_s == pytest.approx(left_s)
+
+
+def test_on_a_bus_of_its_own_it_waits_for_nothing_and_still_hears_another() -> None:
+    others = OtherControllers([NODE], MASTER, lambda: 0.0, private=True)
+    assert others.to_listen_s == 0.0
+    others.refuse()
+    others.on_message_received(can.Message(arbitration_id=0x080, is_extended_id=False))
+    with pytest.raises(BusError, match="another controller is active on this bus: 1 x SYNC"):
+        others.refuse()
+
+
+@pytest.mark.parametrize(("interface", "waits_s"), [("jointctl", 0.0), ("socketcan", LISTEN_S), ("virtual", LISTEN_S)])
+@pytest.mark.parametrize("private", [True, False])
+def test_a_bus_of_metal_is_listened_to_whatever_a_session_takes_it_for(
+    monkeypatch: pytest.MonkeyPatch, interface: str, waits_s: float, private: bool
+) -> None:
+    config = moved(load_config(CONFIGS / "virtual.toml"), GivenPlace(interface, "here"), {})
+    monkeypatch.setattr(open_module, "open_python_can", lambda *_: can.Bus("here", interface="virtual"))
+    drive = cast(CanopenDrive, CanopenSession().open(config, private=private))
+    try:
+        assert drive._others._wanted_s == (waits_s if private else LISTEN_S)
+    finally:
+        drive.close()
 
 
 @pytest.mark.parametrize("echoes", [True, False])
