@@ -34,6 +34,7 @@ from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.sessions import output
+from tests.unit.hil.test_lockstep_arm import on_two_buses
 
 KINDS = kinds_during("run")
 PERIOD_NS = 1_000_000
@@ -117,6 +118,17 @@ def test_what_is_the_computers_reaches_every_drive(arm: ArmConfig, joints: Locks
         assert run.fault in FAULT_CLASSES[FaultKind.BUS_OFF].causes
 
 
+@pytest.mark.parametrize(("axis", "touched"), [(0, [0, 1]), (2, [2])])
+def test_an_adapter_that_is_off_one_of_two_buses_is_a_fault_of_the_joints_on_it(
+    arm: ArmConfig, axis: int, touched: list[int]
+) -> None:
+    given = on_two_buses(arm)
+    scenario = of_kind(given, FaultKind.BUS_OFF, axis, harmless=False)
+    assert scenario.touched(given.joints) == touched
+    assert scenario.touched(arm.joints) == [0, 1, 2]
+    assert judge_arm(LockstepArm(given), masses_of(given), scenario).violations == ()
+
+
 # --- each invariant notices ---
 
 
@@ -134,7 +146,7 @@ def lines(arm: ArmConfig, joints: LockstepArm, runs: list[LockstepRun], scenario
     return [
         *arm_campaign._torque_before_all(runs, start_ns, PERIOD_NS),
         *arm_campaign._not_together(runs),
-        *arm_campaign._wrong_report(runs, scenario, arm.names, rows, start_ns, PERIOD_NS),
+        *arm_campaign._wrong_report(runs, scenario, arm, rows, start_ns, PERIOD_NS),
     ]
 
 

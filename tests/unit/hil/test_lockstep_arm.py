@@ -75,7 +75,7 @@ def test_a_bus_that_is_lost_stops_the_joints_of_both(arm: LockstepArm, faulty: i
     first = [int(np.argmax(run.log.fault != 0)) if run.log.fault.any() else 1 << 30 for run in runs]
     blamed = {name for name, row in zip(given.names, first, strict=True) if row == min(first)}
     assert blamed == lost
-    assert {runs[axis].fault for axis in range(3) if given.names[axis] in lost} == {Fault.STALE_SAMPLE}
+    assert {runs[axis].fault for axis in range(3) if given.names[axis] in lost} == {Fault.BUS_ERROR}
     began = [int(np.argmax(run.log.phase >= AxisPhase.RAMPING)) for run in runs]
     assert max(began) - min(began) <= 1
     for run in runs:
