@@ -15,14 +15,12 @@ from 0, temperature_degC may be empty.  Beside it lies a JSON file of the same s
 torque_constant_NmpA, and, if known, limits (torque_max_Nm, velocity_max_radps of the joint); both signs are such that
 friction opposes motion (torque and velocity have the same sign).
 
-Of any other table the user gives columns, units and sides; nothing is guessed.  Delimiter, decimal comma, byte-order
-mark, comments and quotes are recognised.  Every problem is one `DataError` that names file, line and value.
+Of any other table the user gives columns, units and sides; nothing is guessed (`tables` says what of its form is
+recognised).  Every problem is one `DataError` that names file, line and value.
 """
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,133 +30,9 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, parse_json, read_input
+from jointctl.firmware_py.input_file import number_from, parse_json
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
-
-# --- a CSV file of numbers ---
-
-DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
-LARGEST_NUMBER = 1e100  # whatever it means, its squares are numbers as well
-
-
-@dataclass(frozen=True)
-class TableFile:
-    """The text cells of a file; `rows` holds (line number, cells)."""
-
-    path: Path
-    sha256: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[int, tuple[str, ...]], ...]
-    decimal_comma: bool
-    ended: bool  # the last line has its line end
-
-    def column(self, name: str) -> int:
-        """Index of a column by its name (case ignored) or number from 1."""
-        lowered = [c.lower() for c in self.columns]
-        if lowered.count(name.lower()) > 1:
-            raise DataError(f"{self.path}: column {name!r} occurs {lowered.count(name.lower())} times")
-        if name.lower() in lowered:
-            return lowered.index(name.lower())
-        if name.isdigit() and 1 <= int(name) <= len(self.columns):
-            return int(name) - 1
-        raise DataError(f"{self.path}: no column {name!r}", f"the file has: {', '.join(self.columns)}")
-
-    def number(self, row: tuple[int, tuple[str, ...]], index: int, *, empty: float | None = None) -> float:
-        """A finite number; an empty cell is `empty` if that is given."""
-        line, cells = row
-        text = cells[index].strip()
-        if not text and empty is not None:
-            return empty
-        try:
-            value = number_from(text.replace(",", ".") if self.decimal_comma else text)
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= LARGEST_NUMBER:
-            raise DataError(
-                f"{self.path}: line {line}: {self.columns[index]} (={text[:40] or 'empty'}) must be a finite number"
-                + (f", at most {LARGEST_NUMBER:g}" if math.isfinite(value) else "")
-            )
-        return value
-
-
-def read_bytes(path: Path) -> bytes:
-    try:
-        return read_input(path, LARGEST_TABLE_BYTES)
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder, not a data file") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def _text(path: Path, content: bytes) -> str:
-    if b"\0" in content[:65536] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise DataError(f"{path}: is a binary file (byte {content.index(0)} is zero), not a CSV table")
-    try:
-        return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: byte {error.start} is not UTF-8 text: not a CSV table") from None
-
-
-def _delimiter(path: Path, header: str, wanted: str) -> str:
-    if wanted not in DELIMITERS:
-        raise UsageError(f"--delimiter (={wanted}) must be one of auto, comma, semicolon, tab, space")
-    if wanted != "auto":
-        return DELIMITERS[wanted]
-    for candidate in (";", "\t", ","):  # a comma may be a decimal one, so it comes last
-        if candidate in header:
-            return candidate
-    if len(header.split()) > 1:
-        return " "
-    raise DataError(f"{path}: line 1 (={header[:40]}) must hold at least two columns", "tell --delimiter")
-
-
-def read_table(path: Path, delimiter: str = "auto") -> TableFile:
-    """Header and rows; lines that begin with # and empty lines are skipped."""
-    content = read_bytes(path)
-    lines = [(n, line) for n, line in enumerate(_text(path, content).splitlines(), 1)
-             if line.strip() and not line.lstrip().startswith("#")]  # fmt: skip
-    if not lines:
-        raise DataError(f"{path}: is empty: a header and one line a point are needed")
-    mark = _delimiter(path, lines[0][1], delimiter)
-
-    def split(line: str) -> tuple[str, ...]:
-        if mark == " ":
-            return tuple(line.split())
-        return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=mark)))
-
-    columns = split(lines[0][1])
-    if all(_is_number(cell.replace(",", ".")) for cell in columns):
-        # no header: the columns have numbers only
-        columns = tuple(str(k + 1) for k in range(len(columns)))
-    else:
-        del lines[0]
-    rows = tuple((n, split(line)) for n, line in lines)
-    if not rows:
-        raise DataError(f"{path}: has a header but no points")
-    for n, cells in rows:
-        if len(cells) != len(columns):
-            last = " (the last line: is the file cut off?)" if n == rows[-1][0] else ""
-            raise DataError(f"{path}: line {n} has {len(cells)} columns, the header {len(columns)}{last}")
-    return TableFile(
-        path, hashlib.sha256(content).hexdigest(), columns, rows, mark == ";" and _comma(rows), content.endswith(b"\n")
-    )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        number_from(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _comma(rows: tuple[tuple[int, tuple[str, ...]], ...]) -> bool:
-    """Decimal commas: with ; between the columns, some cell has a comma and none has a point."""
-    text = "".join("".join(cells) for _, cells in rows)
-    return "," in text and "." not in text
-
+from jointctl.tools.identification.tables import TableFile, read_bytes, read_table
 
 # --- the points, and which of them are used ---
 
@@ -186,12 +60,6 @@ class FrictionData:
         return np.flatnonzero(self.settled & (sign * self.velocity_radps > 0.0))
 
 
-def numbers(table: TableFile, column: str) -> np.ndarray:
-    """A column (N,) of finite numbers; `DataError` names the line of anything else."""
-    index = table.column(column)
-    return np.array([table.number(row, index) for row in table.rows])
-
-
 def from_table(
     table: TableFile,
     velocity: np.ndarray,
@@ -201,8 +69,9 @@ def from_table(
     constant: float | None,
 ) -> FrictionData:
     """Points as the file has them, with their lines: rad/s of the joint, Nm at the motor."""
-    line = np.array([n for n, _ in table.rows])
-    return FrictionData(table.path, table.sha256, velocity, torque, line, settled, ratio, constant)
+    return FrictionData(
+        table.path, table.sha256, velocity, torque, table.numbered, settled, ratio, constant, table.notes
+    )
 
 
 def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
@@ -210,7 +79,7 @@ def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
 
     `ordered`: the file is expected to be in order of velocity, so that a note says where it is not.
     """
-    notes = []
+    notes = list(data.notes)
     cells = np.column_stack([data.velocity_radps, data.motor_torque_Nm])
     _, first = np.unique(cells, axis=0, return_index=True)
     keep = np.zeros(len(cells), bool)
@@ -275,7 +144,13 @@ def check_directions(data: FrictionData, both: bool) -> None:
 # --- a table with columns of other names ---
 
 SIDES = ("joint", "motor")
-RAD_PER_UNIT = {"rad": 1.0, "deg": math.pi / 180.0, "turn": math.tau}
+SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+RAD_PER_UNIT = {"rad": 1.0, "deg": math.pi / 180.0, "turn": math.tau, "count": math.nan}  # count: --counts-per-turn
+VELOCITY_UNITS = {**RADPS_PER_UNIT, "turn/s": math.tau, "count/s": math.nan}
+Nm_PER_UNIT = {"Nm": 1.0, "Ncm": 1e-2, "mNm": 1e-3}
+A_PER_UNIT = {"A": 1.0, "mA": 1e-3}
+DEGC_OF_UNIT = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)}
+REVERSIBLE = ("position", "velocity", "torque", "load")
 
 
 @dataclass(frozen=True)
@@ -286,50 +161,134 @@ class ForeignFormat:
     torque_column: str | None = None
     current_column: str | None = None
     velocity_unit: str | None = None
-    side: str | None = None  # of the velocity
+    side: str | None = None  # of velocity and position
     torque_side: str | None = None
     ratio: float | None = None
     torque_constant_NmpA: float | None = None
     delimiter: str = "auto"
+    torque_unit: str = "Nm"
+    current_unit: str = "A"
+    counts_per_turn: float | None = None  # of the shaft on whose side the counts are
+    reverse: Sequence[str] = ()  # of REVERSIBLE: columns whose sign is the other way round
+    where: Sequence[str] = ()  # COLUMN=VALUE: lines that are used
     # of a time series
-    time_column: str | None = None  # [s]
+    time_column: str | None = None
+    time_unit: str = "s"
+    sample_rate_Hz: float | None = None  # takes the place of the time's column
     position_column: str | None = None
     position_unit: str | None = None
+    position_side: str | None = None  # None: that of the velocity
     load_column: str | None = None  # torque at the joint that the load is known to need [Nm]
-    temperature_column: str | None = None  # [degC]
+    temperature_column: str | None = None
+    temperature_unit: str = "degC"
+    motion_column: str | None = None  # where it changes another motion begins; if it is that of the time: goes back
 
     @property
     def mapped(self) -> bool:
         return bool(self.velocity_column or self.torque_column or self.current_column)
 
+    def sign(self, name: str) -> float:
+        return -1.0 if name in self.reverse else 1.0
+
+    def rad_per_unit(self, unit: str) -> float:
+        """Radians, or rad/s, of the shaft."""
+        if unit in ("count", "count/s"):
+            assert self.counts_per_turn is not None
+            return math.tau / self.counts_per_turn
+        return {**RAD_PER_UNIT, **VELOCITY_UNITS}[unit]
+
 
 def check_given(given: ForeignFormat) -> None:
     """`UsageError` names a flag whose value is not allowed."""
     for flag, value, allowed in (
-        ("--velocity-unit", given.velocity_unit, tuple(RADPS_PER_UNIT)),
+        ("--velocity-unit", given.velocity_unit, tuple(VELOCITY_UNITS)),
         ("--side", given.side, SIDES),
         ("--torque-side", given.torque_side, SIDES),
+        ("--position-side", given.position_side, SIDES),
         ("--position-unit", given.position_unit, tuple(RAD_PER_UNIT)),
+        ("--time-unit", given.time_unit, tuple(SECONDS_PER_UNIT)),
+        ("--torque-unit", given.torque_unit, tuple(Nm_PER_UNIT)),
+        ("--current-unit", given.current_unit, tuple(A_PER_UNIT)),
+        ("--temperature-unit", given.temperature_unit, tuple(DEGC_OF_UNIT)),
+        *(("--reverse", each, REVERSIBLE) for each in given.reverse),
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
     for flag, number, low, high in (
         ("--ratio", given.ratio, 1.0, 1000.0),
         ("--torque-constant", given.torque_constant_NmpA, 1e-6, 100.0),
+        ("--counts-per-turn", given.counts_per_turn, 1.0, 2.0**40),
+        ("--sample-rate", given.sample_rate_Hz, 1.0, 1e6),
     ):
         if number is not None and not low <= number <= high:
             raise UsageError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
     if given.torque_column and given.current_column:
         raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
+    if given.time_column and given.sample_rate_Hz:
+        raise UsageError("--time-column and --sample-rate: give one of them")
+    for unit in (given.position_unit, given.velocity_unit):
+        if unit in ("count", "count/s") and given.counts_per_turn is None:
+            raise UsageError(f"--counts-per-turn is missing: a unit (={unit}) needs it")
 
 
 def require_told(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
     """`UsageError` where what a table does not tell was not given: the torque's column, and each (flag, value)."""
     if not (given.torque_column or given.current_column):
         raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
+    if given.current_column:
+        if given.torque_constant_NmpA is None:
+            raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
+        if given.torque_side == "joint":
+            raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
     for flag, value in needed:
         if value is None:
             raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+    if given.torque_column and given.torque_side is None:
+        raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
+
+
+def chosen_lines(table: TableFile, given: ForeignFormat) -> TableFile:
+    """The lines for which each COLUMN=VALUE of `--where` holds, as text or as a number."""
+    for rule in given.where:
+        name, equals, wanted = rule.partition("=")
+        if not equals:
+            raise UsageError(f"--where (={rule}) must be COLUMN=VALUE")
+        texts = table.texts(name.strip())
+        wanted = wanted.strip()
+        chosen = np.array([text == wanted or _same_number(text, wanted) for text in texts])
+        if not chosen.any():
+            some = ", ".join(list(dict.fromkeys(texts))[:6])
+            raise DataError(f"{table.path}: no line has {name.strip()} = {wanted}", f"there are: {some}")
+        table = table.only(chosen)
+    return table
+
+
+def _same_number(text: str, wanted: str) -> bool:
+    try:
+        return number_from(text) == number_from(wanted)
+    except ValueError:
+        return False
+
+
+def velocity_radps(table: TableFile, given: ForeignFormat, *, gaps: bool = False) -> np.ndarray:
+    """(N,) of the joint."""
+    assert given.velocity_column is not None
+    assert given.velocity_unit is not None
+    assert given.ratio is not None
+    scale = given.rad_per_unit(given.velocity_unit) / (given.ratio if given.side == "motor" else 1.0)
+    return table.numbers(given.velocity_column, gaps=gaps) * scale * given.sign("velocity")
+
+
+def motor_torque_Nm(table: TableFile, given: ForeignFormat, *, gaps: bool = False) -> np.ndarray:
+    """(N,) at the motor, from torque or current."""
+    assert given.ratio is not None
+    if given.current_column:
+        assert given.torque_constant_NmpA is not None
+        scale = given.torque_constant_NmpA * A_PER_UNIT[given.current_unit]
+        return table.numbers(given.current_column, gaps=gaps) * scale * given.sign("torque")
+    assert given.torque_column is not None
+    scale = Nm_PER_UNIT[given.torque_unit] / (given.ratio if given.torque_side == "joint" else 1.0)
+    return table.numbers(given.torque_column, gaps=gaps) * scale * given.sign("torque")
 
 
 def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
@@ -338,21 +297,9 @@ def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
         raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
     told = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
     require_told(table, given, told)
-    assert given.velocity_unit is not None
     assert given.ratio is not None
-    scale = RADPS_PER_UNIT[given.velocity_unit] / (given.ratio if given.side == "motor" else 1.0)
-    velocity = numbers(table, given.velocity_column) * scale
-    if given.current_column:
-        if given.torque_constant_NmpA is None:
-            raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
-        if given.torque_side == "joint":
-            raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
-        torque = numbers(table, given.current_column) * given.torque_constant_NmpA
-    else:
-        assert given.torque_column is not None
-        if given.torque_side is None:
-            raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
-        torque = numbers(table, given.torque_column) / (given.ratio if given.torque_side == "joint" else 1.0)
+    table = chosen_lines(table, given)
+    velocity, torque = velocity_radps(table, given), motor_torque_Nm(table, given)
     settled = np.ones(len(velocity), bool)
     return from_table(table, velocity, torque, settled, given.ratio, given.torque_constant_NmpA)
 
@@ -431,17 +378,17 @@ def read_sweep(table: TableFile, given: ForeignFormat) -> FrictionData:
             raise DataError(
                 f"--ratio (={given.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
             )
-    velocity = numbers(table, "velocity_radps")
-    torque = numbers(table, "motor_torque_Nm")
+    velocity = table.numbers("velocity_radps")
+    torque = table.numbers("motor_torque_Nm")
     settled = np.ones(len(velocity), bool)
     if "settled" in table.columns:
-        values = numbers(table, "settled")
-        for (line, _), value in zip(table.rows, values, strict=True):
+        values = table.numbers("settled")
+        for line, value in zip(table.numbered, values, strict=True):
             if value not in (0.0, 1.0):
                 raise DataError(f"{table.path}: line {line}: settled (={value:g}) must be 0 or 1")
         settled = values == 1.0
     if "current_A" in table.columns and math.isfinite(constant):
-        current = numbers(table, "current_A")
+        current = table.numbers("current_A")
         moving = np.abs(current) > 0.2 * np.max(np.abs(current), initial=0.0)
         if np.any(moving):
             found = float(np.median(torque[moving] / current[moving]))
@@ -458,8 +405,9 @@ def read_friction_data(path: str | Path, given: ForeignFormat | None = None, *, 
     """Read and check; `both` asks for enough points in both directions, else one is enough to go on with."""
     path, given = Path(path), given or ForeignFormat()
     check_given(given)
-    if given.time_column is not None:
-        raise UsageError(f"--time-column (={given.time_column}) is for time series, which only `identify` reads")
+    for flag, of_time in (("--time-column", given.time_column), ("--sample-rate", given.sample_rate_Hz)):
+        if of_time is not None:
+            raise UsageError(f"{flag} (={of_time}) is for time series, which only `identify` reads")
     table = read_table(path, given.delimiter)
     ours = not given.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
     if ours:

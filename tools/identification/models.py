@@ -163,14 +163,17 @@ def branch(form: Form, beta: np.ndarray, ws: float, knee: float, top_radps: floa
 # At the joint, with the speed v, the torque tau that the reducer transmits, and the temperature T:
 #
 #     tau = J a + gs sin q + gc cos q                 without a known load, else  J a + (1 + s) load
-#     motor torque times ratio = tau + sign(v) (C fc + V fv)
+#     motor torque times ratio = tau - r(q) + sign(v) (C fc + V fv) (1 + f(q))
 #     C = tc + (ts - tc) exp(-|v| / ws) + kc |tau|            fc = exp(-bc (T - T0))
 #     V = (11) less its Coulomb and Stribeck part + kv |tau| |v|        fv = exp(-bv (T - T0))
 #
-# tc, ts, ws and V belong to a direction, the rest to both.  Friction that goes with |tau| and always opposes the motion
+# tc, ts, ws and V belong to a direction, the rest to both.  r and f are sines of the motor's angle (1, 2 and 4 a turn)
+# and of the joint's (1 and 2): ripple, which goes with the angle alone, and the share of the friction that goes with the
+# angle and turns round with the motion.  Both pass through the filter of the torque.
+# Friction that goes with |tau| and always opposes the motion
 # is that of the load-dependent models of Rhoban's BAM; beside it, a gear that loses more in one direction of power than
 # in the other looks like an error s of the known load, as sign(v) |tau| and tau span both.  Not modelled: hysteresis,
-# dependence on position, backlash.
+# backlash, other periods.
 
 WS_MAX_radps = 20.0 * DEGREE
 SIGNS = {"positive": 1, "negative": -1}
@@ -180,6 +183,13 @@ FORM_STEPS = {
     "stribeck": ("multi-stage-continuous",),
     "multi-stage-continuous": (),
 }
+ORDERS = {
+    "m1": (1.0, True),
+    "m2": (2.0, True),
+    "m4": (4.0, True),
+    "j1": (1.0, False),
+    "j2": (2.0, False),
+}  # of the motor
 TERMS = {
     "inertia": ("inertia",),
     "gravity": ("gravity_sin", "gravity_cos"),
@@ -188,16 +198,20 @@ TERMS = {
     "load-viscous": ("load_viscous",),
     "temperature-coulomb": ("temperature_coulomb",),
     "temperature-viscous": ("temperature_viscous",),
-}
+    **{f"{kind}-{order}": (f"{kind}_sin {order}", f"{kind}_cos {order}")
+       for kind in ("ripple", "angle") for order in ORDERS},
+}  # fmt: skip
 UNITS = {
     "inertia": "kg m2", "gravity_sin": "Nm", "gravity_cos": "Nm", "load_scale": "", "load_coulomb": "Nm/Nm",
-    "load_viscous": "s/rad", "temperature_coulomb": "1/K", "temperature_viscous": "1/K",
+    "load_viscous": "s/rad", "ripple_sin": "Nm", "ripple_cos": "Nm", "angle_sin": "", "angle_cos": "",
+    "temperature_coulomb": "1/K", "temperature_viscous": "1/K",
     "tc": "Nm", "rise": "Nm", "tv": "Nm s/rad", "ws": "rad/s", "c1": "Nm", "c2": "Nm", "c3": "Nm",
 }  # fmt: skip
 BOUNDS = {
     "tc": (0.0, np.inf), "tv": (0.0, np.inf), "rise": (0.0, np.inf),
     "load_coulomb": (0.0, 2.0), "load_viscous": (0.0, 2.0),
     "temperature_coulomb": (-0.2, 0.2), "temperature_viscous": (-0.2, 0.2),
+    "angle_sin": (-0.9, 0.9), "angle_cos": (-0.9, 0.9),
 }  # fmt: skip
 
 EXPERIMENTS = {  # which would tell a parameter that the data leave open
@@ -225,11 +239,12 @@ class Samples:
     position_rad: np.ndarray
     load_Nm: np.ndarray | None
     warming_K: np.ndarray | None  # above T0
+    waves: np.ndarray | None = None  # (N, 2 len(ORDERS)): sine and cosine of each order, filtered
 
     def part(self, chosen: np.ndarray | slice) -> Samples:
-        load, warming = (None if v is None else v[chosen] for v in (self.load_Nm, self.warming_K))
+        load, warming, waves = (None if v is None else v[chosen] for v in (self.load_Nm, self.warming_K, self.waves))
         moved = self.velocity_radps[chosen], self.acceleration_radps2[chosen], self.position_rad[chosen]
-        return Samples(*moved, load, warming)
+        return Samples(*moved, load, warming, waves)
 
 
 @dataclass(frozen=True)
@@ -281,7 +296,14 @@ class Model:
         if s.warming_K is not None:
             coulomb = coulomb * np.exp(-value.get("temperature_coulomb", 0.0) * s.warming_K)
             rest = rest * np.exp(-value.get("temperature_viscous", 0.0) * s.warming_K)
-        return np.asarray(np.sign(s.velocity_radps) * (coulomb + rest))
+        return np.asarray(np.sign(s.velocity_radps) * (coulomb + rest) * (1.0 + self.of_angle("angle", value, s)))
+
+    def of_angle(self, kind: str, value: Mapping[str, float], s: Samples) -> np.ndarray | float:
+        """Sum of the sines of ripple [Nm] or angle (share of the friction)."""
+        if s.waves is None:
+            return 0.0
+        weights = [value.get(f"{kind}_{wave} {order}", 0.0) for order in ORDERS for wave in ("sin", "cos")]
+        return np.asarray(s.waves @ np.array(weights)) if any(weights) else 0.0
 
     def own(self, value: Mapping[str, float], word: str) -> tuple[np.ndarray, float]:
         """(linear parameters of a direction in the order of its form, ws of the top speed)."""
@@ -296,7 +318,17 @@ class Model:
         """Motor torque times ratio (N,)."""
         value = dict(zip(self.names, vector, strict=True))
         tau = self.transmitted_Nm(value, s)
-        return tau + self.friction_Nm(value, s, tau)
+        return tau + self.friction_Nm(value, s, tau) - self.of_angle("ripple", value, s)
+
+    def waves(self, value: Mapping[str, float], kind: str, ratio: float) -> list[tuple[float, float, float]]:
+        """(amplitude, periods a motor turn, phase [rad]) of each sine of ripple or angle, the largest first."""
+        found = []
+        for order, (count, of_motor) in ORDERS.items():
+            sine, cosine = (value.get(f"{kind}_{wave} {order}", 0.0) for wave in ("sin", "cos"))
+            if f"{kind}-{order}" in self.terms:
+                periods = count if of_motor else count / ratio
+                found.append((float(np.hypot(sine, cosine)), periods, float(np.arctan2(cosine, sine))))
+        return sorted(found, reverse=True)
 
 
 def jacobian(model: Model, vector: np.ndarray, samples: Samples) -> np.ndarray:

@@ -24,28 +24,27 @@ from scipy.signal import butter, sosfiltfilt
 from jointctl.drivers.errors import DataError, UsageError
 from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
 from jointctl.tools.identification.friction_data import (
     MIN_PER_DIRECTION,
-    RAD_PER_UNIT,
     ForeignFormat,
-    TableFile,
     check_given,
-    numbers,
     read_sidecar,
-    read_table,
-    require_told,
 )
+from jointctl.tools.identification.tables import read_table
 
 BAND_Hz, BAND_SHARE = 20.0, 0.2  # default: at most this share of the rate; with a running mean its first zero
 LEAST_SAMPLES = 200
+_LEAST_STEP_s, _MOST_STEP_s = 1e-5, 0.1
 _GAP = 3.0  # times the usual step of time
 _FACTOR_TOLERANCE = 0.05  # of velocity over slope of position: gears and filters give some per cent
 _SATURATED_SHARE = 0.005  # of the samples at the greatest torque: more is a limit, not a peak
 _TWICE_SHARE = 0.2  # of the samples: more at the time of the one before are a clock that is too coarse
 _SAME = 1e-9
 _SAME_RATE = 0.01
-_TOP_SPEED_radps = 100.0  # of a joint behind a reducer
+_TOP_SPEED_radps, _DIRECT = 100.0, 2.0  # of a joint behind a reducer; with a ratio below it is that of a motor
+_DIRECT_SPEED_radps = 1000.0
+_MOST_rad = 4.0 * math.pi  # of a joint: farther is told
+_LEVELS = 4.0  # times as often as the value before it a limit is reached; the end of a coarse range is not
 _SIDE_TOLERANCE = 0.5  # of the logarithm of a factor that is near the ratio
 
 
@@ -91,6 +90,8 @@ class Motion:
     torque_name: str  # of the column
     speed_name: str  # of the velocity's column, or of the position's where there is none
     notes: tuple[str, ...] = ()
+    placed: bool = True  # the position is that of a column, not of an integral
+    mounting: dict[str, int] | None = None  # direction and zero_counts of the encoder, where they are known
     plateaus: bool = False  # a sample is the mean over a plateau of constant speed
 
     def used(self, settings: MotionSettings) -> np.ndarray:
@@ -105,7 +106,7 @@ class Motion:
 
 
 @dataclass
-class _Raw:
+class RawMotion:
     """Columns as they were read, in SI at the joint, with the names under which problems are reported."""
 
     path: Path
@@ -118,6 +119,7 @@ class _Raw:
     velocity_radps: np.ndarray | None = None
     load_Nm: np.ndarray | None = None
     temperature_degC: np.ndarray | None = None
+    mounting: dict[str, int] | None = None
     notes: list[str] = field(default_factory=list)
 
     def keep(self, chosen: np.ndarray) -> None:
@@ -125,6 +127,24 @@ class _Raw:
         for name in ("time_s", "torque_Nm", "position_rad", "velocity_radps", "load_Nm", "temperature_degC"):
             values = getattr(self, name)
             setattr(self, name, None if values is None else values[chosen])
+
+    def keep_known(self) -> None:
+        """Leave out samples without a value; a temperature, which is read more rarely, is followed in between."""
+        known = np.ones(len(self.time_s), bool)
+        columns = {"time": self.time_s, "position": self.position_rad, "velocity": self.velocity_radps,
+                   "torque": self.torque_Nm, "load": self.load_Nm}  # fmt: skip
+        for name, values in columns.items():
+            missing = np.zeros(len(known), bool) if values is None else ~np.isfinite(values)
+            if missing.any():
+                self.notes.append(f"{self.names[name]}: {np.count_nonzero(missing)} samples without a value: left out")
+            known &= ~missing
+        if not known.all():
+            self.keep(known)
+        warm = self.temperature_degC
+        if warm is not None and not np.isfinite(warm).all():
+            there = np.isfinite(warm)
+            self.notes.append(f"{self.names['temperature']}: {np.count_nonzero(there)} readings: followed in between")
+            self.temperature_degC = np.interp(self.time_s, self.time_s[there], warm[there]) if there.any() else None
 
     def problem(self, which: str, seen: str, hint: str = "") -> DataError:
         return DataError(f"{self.path}: {self.names[which]}: {seen}", hint)
@@ -134,15 +154,9 @@ class _Raw:
 
 
 def is_series(path: Path, given: ForeignFormat | None) -> bool:
-    """Whether a file holds a time series: a run log, or a table with a column of time named by the user."""
-    return path.suffix.lower() == ".mcap" or (given is not None and given.time_column is not None)
-
-
-def read_motion(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
-    """A table: read, check, filter."""
-    settings.check()
-    check_given(given)
-    return _prepared(_table(path, given), settings)
+    """Whether a file holds a time series: a run log, or a table whose column of time or rate the user gives."""
+    timed = given is not None and (given.time_column is not None or given.sample_rate_Hz is not None)
+    return path.suffix.lower() == ".mcap" or timed
 
 
 def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
@@ -153,13 +167,13 @@ def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
     if not {"load_Nm", "velocity_radps", "motor_torque_Nm", "temperature_degC"} <= set(table.columns):
         return None
     ratio = float(read_sidecar(path)["reduction_ratio"])
-    settled = numbers(table, "settled") == 1.0
+    settled = table.numbers("settled") == 1.0
     notes = [f"{np.count_nonzero(~settled)} points never settled: not used"] if not settled.all() else []
     warm_index = table.column("temperature_degC")
     degC = np.array([table.number(row, warm_index, empty=math.nan) for row in table.rows])[settled]
 
     def column(name: str) -> np.ndarray:
-        return numbers(table, name)[settled]
+        return table.numbers(name)[settled]
 
     velocity, load = column("velocity_radps"), column("load_Nm")
     if len(velocity) < 2 * MIN_PER_DIRECTION:
@@ -190,10 +204,10 @@ def motion_of_log(path: Path, log: LoggedRun, given: ForeignFormat, settings: Mo
     """A run log: check, filter."""
     settings.check()
     check_given(given)
-    return _prepared(_run_log(path, log, given), settings)
+    return prepared_motion(_run_log(path, log, given), settings)
 
 
-def _run_log(path: Path, log: LoggedRun, given: ForeignFormat) -> _Raw:
+def _run_log(path: Path, log: LoggedRun, given: ForeignFormat) -> RawMotion:
     """Measured position and torque of the phases in which the law moves the joint."""
     records = log.records
     records = records[(records.phase >= AxisPhase.APPROACH) & (records.phase <= AxisPhase.RAMPING)]
@@ -215,65 +229,33 @@ def _run_log(path: Path, log: LoggedRun, given: ForeignFormat) -> _Raw:
     }
     with open_input(path, LARGEST_LOG_BYTES) as file:
         sha256 = hashlib.sha256(file.read()).hexdigest()
-    raw = _Raw(
+    raw = RawMotion(
         path, sha256, (time_ns - time_ns[0]) * 1e-9,
         np.asarray(records.measured_torque_Nm, float), ratio, names, np.asarray(records.position_rad, float),
     )  # fmt: skip
     if len(log.temperatures):
         at_s = (log.temperatures["time_ns"] - time_ns[0]) * 1e-9
         raw.temperature_degC = np.interp(raw.time_s, at_s, log.temperatures["temperature_degC"])
+    raw.mounting = _mounting(log)
     if not log.complete:
         raw.notes.append("the log was cut off: its tail is missing")
     return raw
 
 
-def _table(path: Path, given: ForeignFormat) -> _Raw:
-    assert given.time_column is not None
-    table = read_table(path, given.delimiter)
-    _check_mapped(table, given)
-    assert given.ratio is not None
-    ratio = given.ratio
-    to_joint = 1.0 / ratio if given.side == "motor" else 1.0
-    names = {"time": given.time_column, "torque": given.torque_column or given.current_column or ""}
-    if given.current_column:
-        assert given.torque_constant_NmpA is not None
-        torque = numbers(table, given.current_column) * given.torque_constant_NmpA * ratio
-    else:
-        assert given.torque_column is not None
-        torque = numbers(table, given.torque_column) * (ratio if given.torque_side == "motor" else 1.0)
-    raw = _Raw(path, table.sha256, numbers(table, given.time_column), torque, ratio, names)
-    if given.position_column:
-        assert given.position_unit is not None
-        names["position"] = given.position_column
-        raw.position_rad = numbers(table, given.position_column) * RAD_PER_UNIT[given.position_unit] * to_joint
-    if given.velocity_column:
-        assert given.velocity_unit is not None
-        names["velocity"] = given.velocity_column
-        raw.velocity_radps = numbers(table, given.velocity_column) * RADPS_PER_UNIT[given.velocity_unit] * to_joint
-    if given.load_column:
-        names["load"] = given.load_column
-        raw.load_Nm = numbers(table, given.load_column)
-    if given.temperature_column:
-        names["temperature"] = given.temperature_column
-        raw.temperature_degC = numbers(table, given.temperature_column)
-    return raw
+def _mounting(log: LoggedRun) -> dict[str, int] | None:
+    """How the encoder was mounted, as the log's configuration has it."""
+    try:
+        encoder = tomllib.loads(log.metadata["run"]["configuration"])["encoder"]
+        return {key: int(encoder[key]) for key in ("direction", "zero_counts")}
+    except (KeyError, ValueError, TypeError):
+        return None
 
 
-def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
-    """`UsageError` where something that a table does not tell was not given."""
-    if not (given.position_column or given.velocity_column):
-        missing = "--position-column or --velocity-column is missing"
-        raise UsageError(missing, f"the file has: {', '.join(table.columns)}")
-    needed: list[tuple[str, object]] = [("--side", given.side), ("--ratio", given.ratio)]
-    needed += [("--position-unit", given.position_unit)] if given.position_column else []
-    needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
-    needed += [("--torque-side", given.torque_side)] if given.torque_column else []
-    needed += [("--torque-constant", given.torque_constant_NmpA)] if given.current_column else []
-    require_told(table, given, needed)
+def joined(motions: Sequence[Motion], *, named: bool = True) -> Motion:
+    """Several motions of one joint, one after the other; `DataError` where they do not go together.
 
-
-def joined(motions: Sequence[Motion]) -> Motion:
-    """Several motions of one joint, one after the other; `DataError` where they do not go together."""
+    `named`: notes begin with the name of the file.
+    """
     first = motions[0]
     if len(motions) == 1:
         return first
@@ -291,7 +273,7 @@ def joined(motions: Sequence[Motion]) -> Motion:
         parts = [getattr(each, name) for each in motions]
         return None if any(part is None for part in parts) else np.concatenate(parts)
 
-    notes = [f"{each.path.name}: {note}" for each in motions for note in each.notes]
+    notes = [f"{each.path.name}: {note}" if named else note for each in motions for note in each.notes]
     warm = together("temperature_degC")
     if warm is None and any(each.temperature_degC is not None for each in motions):
         notes.append("temperature: not in every file, so in none is it used")
@@ -299,7 +281,7 @@ def joined(motions: Sequence[Motion]) -> Motion:
     times = [start + each.time_s - each.time_s[0] for start, each in zip(starts, motions, strict=True)]
     return replace(
         first, time_s=np.concatenate(times), temperature_degC=warm, notes=tuple(notes),
-        sha256=" ".join(each.sha256 for each in motions),
+        sha256=" ".join(dict.fromkeys(each.sha256 for each in motions)),
         **{name: together(name) for name in names},
     )  # fmt: skip
 
@@ -307,7 +289,7 @@ def joined(motions: Sequence[Motion]) -> Motion:
 # --- what is wrong with the data, before anything is fitted ---
 
 
-def _clock(raw: _Raw) -> float:
+def clock_step_s(raw: RawMotion) -> float:
     """The usual step of time [s]; `DataError` where the clock does not go on."""
     twice = np.append(False, np.diff(raw.time_s) == 0.0)
     if 0 < np.count_nonzero(twice) <= _TWICE_SHARE * len(twice):
@@ -324,7 +306,13 @@ def _clock(raw: _Raw) -> float:
         at = int(back[0])
         raise raw.problem(
             "time", f"does not go on at sample {at + 2}: {raw.time_s[at]:.6g} s, then {raw.time_s[at + 1]:.6g} s"
-            + (f", and {len(back) - 1} times more" if len(back) > 1 else ""), "the clock was set, or files are joined",
+            + (f", and {len(back) - 1} times more" if len(back) > 1 else ""),
+            "the clock was set, or is too coarse (--sample-rate), or motions are joined (--motion-column)",
+        )  # fmt: skip
+    if not _LEAST_STEP_s <= step <= _MOST_STEP_s:
+        raise raw.problem(
+            "time", f"usual step is {step:.3g} s: must be in [{_LEAST_STEP_s:g}..{_MOST_STEP_s:g}] s",
+            "--time-unit: s, ms, us or ns",
         )  # fmt: skip
     gaps = np.flatnonzero(steps > _GAP * step)
     if len(gaps):
@@ -337,7 +325,7 @@ def _clock(raw: _Raw) -> float:
     return step
 
 
-def _check_units(raw: _Raw, position: np.ndarray, velocity: np.ndarray, slope: np.ndarray) -> None:
+def _check_units(raw: RawMotion, position: np.ndarray, velocity: np.ndarray, slope: np.ndarray) -> None:
     """Velocity against the slope of position: a wrong unit or side shows as a known factor."""
     moving = np.abs(slope) > 0.1 * np.max(np.abs(slope))
     if not moving.any() or float(np.ptp(position)) == 0.0:
@@ -360,11 +348,14 @@ def _check_units(raw: _Raw, position: np.ndarray, velocity: np.ndarray, slope: n
                     "velocity", f"is {factor:.4g} times the slope of {raw.names['position']}: {cause}{sign}"
                 )
     if factor < 0.0 or not 0.8 < factor < 1.25:
-        raise raw.problem("velocity", f"is {factor:.4g} times the slope of {raw.names['position']}: must be near 1")
+        raise raw.problem(
+            "velocity", f"is {factor:.4g} times the slope of {raw.names['position']}: must be near 1",
+            "--reverse velocity, or --reverse position" if factor < 0.0 else "",
+        )  # fmt: skip
     raw.notes.append(f"{raw.names['velocity']} is {factor:.3f} times the slope of {raw.names['position']}")
 
 
-def _saturated(raw: _Raw) -> np.ndarray:
+def _saturated(raw: RawMotion) -> np.ndarray:
     """Samples (N,) at the greatest or least torque, where that is a limit: reached often, in runs, and to the digit."""
     found = np.zeros(len(raw.torque_Nm), bool)
     if not raw.torque_Nm.any():
@@ -374,6 +365,11 @@ def _saturated(raw: _Raw) -> np.ndarray:
         share, held = float(np.mean(there)), np.count_nonzero(there[1:] & there[:-1])
         if share < _SATURATED_SHARE or held < 0.5 * np.count_nonzero(there):
             continue
+        inside = raw.torque_Nm[~there]
+        if len(inside):
+            nearest = inside[np.argmin(np.abs(inside - end_Nm))]
+            if _LEVELS * np.mean(np.abs(raw.torque_Nm - nearest) <= _SAME * abs(end_Nm)) > share:
+                continue
         found |= there
         raw.notes.append(
             f"{raw.names['torque']}: at its {word} value ({end_Nm:.4g} Nm at the joint) in {share:.1%} of the samples: "
@@ -386,9 +382,15 @@ def _saturated(raw: _Raw) -> np.ndarray:
     return found
 
 
-def _prepared(raw: _Raw, settings: MotionSettings) -> Motion:
-    """On a uniform grid, filtered, with the samples marked that nothing spoils."""
-    step = _clock(raw)
+def prepared_motion(raw: RawMotion, settings: MotionSettings) -> Motion:
+    """One motion by itself: `filtered_motion` at its own rate, and checked."""
+    motion = filtered_motion(raw, settings, clock_step_s(raw))
+    require_motion(raw, motion, settings)
+    return motion
+
+
+def filtered_motion(raw: RawMotion, settings: MotionSettings, step: float) -> Motion:
+    """On a uniform grid of `step` [s], filtered, with the samples marked that nothing spoils."""
     saturated = _saturated(raw)
     rate_Hz = 1.0 / step
     window = settings.mean_samples
@@ -398,14 +400,13 @@ def _prepared(raw: _Raw, settings: MotionSettings) -> Motion:
         raise UsageError(
             f"--band (={band_Hz:g} Hz) must be below {0.45 * rate_Hz:.4g} Hz at {rate_Hz:.4g} samples a second"
         )
-    low_pass = butter(2, band_Hz, fs=rate_Hz, output="sos")
     time_s = np.arange(raw.time_s[0], raw.time_s[-1] + 0.5 * step, step)
 
     def at_grid(values: np.ndarray) -> np.ndarray:
         return np.interp(time_s, raw.time_s, values)
 
     def smooth(values: np.ndarray) -> np.ndarray:
-        return np.asarray(sosfiltfilt(low_pass, values))
+        return _smooth(values, rate_Hz, band_Hz)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return smooth(values) if window is None else uniform_filter1d(values, window)
@@ -434,29 +435,48 @@ def _prepared(raw: _Raw, settings: MotionSettings) -> Motion:
     near = maximum_filter1d(spoiled, 2 * margin + 1)
     turns = np.zeros(len(time_s), bool)
     turns[1:] = np.signbit(velocity[1:]) != np.signbit(velocity[:-1])
-    motion = Motion(
+    return Motion(
         raw.path, raw.sha256, rate_Hz, band_Hz, time_s, position, velocity,
         mean(np.gradient(banded, step)) if window else np.gradient(banded, step), mean(torque),
         None if raw.load_Nm is None else mean(at_grid(raw.load_Nm)),
         None if raw.temperature_degC is None else at_grid(raw.temperature_degC), ~near,
         maximum_filter1d(turns, 4 * margin + 1), raw.ratio,
-        raw.names["torque"], raw.names.get("velocity") or raw.names["position"], tuple(raw.notes),
+        raw.names["torque"], raw.names.get("velocity") or raw.names["position"],
+        (*raw.notes, *_far(raw, position)), placed=raw.position_rad is not None, mounting=raw.mounting,
     )  # fmt: skip
-    _check_motion(raw, motion, settings)
-    return motion
 
 
-def _check_motion(raw: _Raw, motion: Motion, settings: MotionSettings) -> None:
+def _smooth(values: np.ndarray, rate_Hz: float, band_Hz: float) -> np.ndarray:
+    return np.asarray(sosfiltfilt(butter(2, band_Hz, fs=rate_Hz, output="sos"), values))
+
+
+def filtered(values: np.ndarray, motion: Motion, settings: MotionSettings) -> np.ndarray:
+    """(N,) through the filter that the torque of a motion has passed."""
+    if settings.mean_samples is not None:
+        return np.asarray(uniform_filter1d(values, settings.mean_samples))
+    return _smooth(values, motion.rate_Hz, motion.band_Hz)
+
+
+def _far(raw: RawMotion, position_rad: np.ndarray) -> list[str]:
+    """A line where a joint behind a reducer turns farther than most can."""
+    span = float(np.ptp(position_rad))
+    if raw.position_rad is None or raw.ratio <= _DIRECT or span <= _MOST_rad:
+        return []
+    return [f"{raw.names['position']}: covers {span:.4g} rad of the joint, {span / math.tau:.3g} turns: is the unit "
+            "another, or the side the motor's?"]  # fmt: skip
+
+
+def require_motion(raw: RawMotion, motion: Motion, settings: MotionSettings) -> None:
     """`DataError` where too little moves, or a size shows that a unit or a side is wrong."""
     used = motion.used(settings)
     if np.count_nonzero(used) < LEAST_SAMPLES:
         raise DataError(
             f"{raw.path}: {motion.speed_name}: {np.count_nonzero(used)} of {len(used)} samples are faster than "
             f"{settings.speed_min_radps:g} rad/s and otherwise usable: at least {LEAST_SAMPLES} are needed",
-            "--speed-min, --acceleration-max",
+            "--speed-min, --acceleration-max; or unit or side is another",
         )
     top = float(np.max(np.abs(motion.velocity_radps[used])))
-    if top > _TOP_SPEED_radps:
+    if top > (_TOP_SPEED_radps if motion.reduction_ratio > _DIRECT else _DIRECT_SPEED_radps):
         raise DataError(f"{raw.path}: {motion.speed_name}: reaches {top:.4g} rad/s of the joint: unit or side is wrong")
     if motion.load_Nm is None or float(np.ptp(motion.load_Nm[used])) == 0.0:
         return
@@ -464,6 +484,11 @@ def _check_motion(raw: _Raw, motion: Motion, settings: MotionSettings) -> None:
     factor = float(load @ motion.torque_Nm[used] / (load @ load))
     # friction spoils the factor; where the load decides on the torque it is small against the ratio
     share = float(np.corrcoef(load, motion.torque_Nm[used])[0, 1] ** 2)
+    if share > 0.5 and factor < 0.0:
+        raise raw.problem(
+            "torque", f"goes against {raw.names['load']} ({factor:.4g} times): the sign of one is the other way round",
+            "--reverse load, or --reverse torque if it does not oppose the motion either",
+        )  # fmt: skip
     for wrong in (raw.ratio, 1.0 / raw.ratio):
         if share > 0.5 and abs(np.log(abs(factor) / wrong)) < _SIDE_TOLERANCE:
             raise raw.problem(

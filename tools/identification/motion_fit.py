@@ -7,6 +7,7 @@ The intervals come from a bootstrap of whole blocks of time, since neighbouring 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,17 +24,19 @@ from jointctl.tools.identification.models import (
     FORM_STEPS,
     FORMS,
     MIN_PER_STAGE,
+    ORDERS,
     SIGNS,
     TERMS,
     Branch,
     Model,
     Samples,
     WS_MAX_radps,
+    basis,
     branch,
     jacobian,
     unit_of,
 )
-from jointctl.tools.identification.motion_data import Motion, MotionSettings
+from jointctl.tools.identification.motion_data import Motion, MotionSettings, filtered
 
 LEVEL = 0.95
 SAMPLES_PER_BAND = 5.0  # of the fit, for each hertz of the band
@@ -51,6 +54,10 @@ _CONSTANT_SPEED = 0.2  # of the median speed, between the thousandths at the end
 _ALONG = 0.9  # rank correlation of acceleration and angle from which on they count as one
 _PLACES, _REPEATS = 60, 0.8  # of the angle; share of the held-out error that is left with a mean for each place
 _WEAK = 0.5
+_SHARE_OF_RATE = 0.4
+_PERIODS, _JOINT_PERIODS = 2.0, 0.5  # of an order that the angle must cover
+_LEAST_SLOW = 0.2  # share of the samples at which an order is within the band
+_WORTH = 1.003  # by which a linear fit to what is left must lower the error for an order to be tried
 
 
 @dataclass(frozen=True)
@@ -108,7 +115,11 @@ class MotionFit:
         return found
 
     def samples(self) -> Samples:
-        return samples_of(self.motion, self.reference_degC)
+        return samples_of(self.motion, self.reference_degC, self.settings)
+
+    def _waves(self, kind: str, unit: str) -> list[dict[str, float]]:
+        found = self.model.waves(self.value, kind, self.motion.reduction_ratio)
+        return [dict(zip((unit, "per_motor_turn", "phase_rad"), wave, strict=True)) for wave in found]
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers, texts, lists and dicts; at the joint."""
@@ -130,16 +141,36 @@ class MotionFit:
                 name: {"value": p.value, "low": p.low, "high": p.high, "unit": unit_of(name), "weak": p.weak or None}
                 for name, p in self.parameters.items()
             },
+            "ripple": self._waves("ripple", "Nm"), "friction_of_angle": self._waves("angle", "share"),
             "steps": [vars(step) for step in self.steps], "untold": list(self.untold), "notes": list(self.notes),
         }  # fmt: skip
 
 
-def samples_of(motion: Motion, reference_degC: float | None) -> Samples:
+def samples_of(motion: Motion, reference_degC: float | None, settings: MotionSettings) -> Samples:
     """All samples of a motion as the model takes them."""
     warm = None
     if motion.temperature_degC is not None and reference_degC is not None:
         warm = motion.temperature_degC - reference_degC
-    return Samples(motion.velocity_radps, motion.acceleration_radps2, motion.position_rad, motion.load_Nm, warm)
+    moved = motion.velocity_radps, motion.acceleration_radps2, motion.position_rad
+    return Samples(*moved, motion.load_Nm, warm, _waves(motion, settings))
+
+
+def _waves(motion: Motion, settings: MotionSettings) -> np.ndarray | None:
+    """Sines of the angle (N, 2 orders), through the filter of the torque; too fast for the rate they are none."""
+    if motion.plateaus or not motion.placed:
+        return None
+    columns = []
+    for count in _counts(motion).values():
+        angle = count * motion.position_rad
+        slow = np.abs(count * motion.velocity_radps) < math.tau * _SHARE_OF_RATE * motion.rate_Hz
+        columns += [filtered(np.where(slow, wave, 0.0), motion, settings) for wave in (np.sin(angle), np.cos(angle))]
+    return np.column_stack(columns)
+
+
+def _counts(motion: Motion) -> dict[str, float]:
+    """Periods a joint turn of each order."""
+    return {order: count * (motion.reduction_ratio if of_motor else 1.0)
+            for order, (count, of_motor) in ORDERS.items()}  # fmt: skip
 
 
 # --- the fit of a given model ---
@@ -262,6 +293,7 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
             f"{name}: the angle covers {np.ptp(motion.position_rad[used]):.3g} rad: gravity cannot be separated from "
             "friction: move over 1 rad or more"
         )
+    terms |= _orders_told(motion, used, both=len(words) == 2)
     if motion.temperature_degC is None:
         untold.append("temperature: no column of it: give --temperature-column, and warm up by 15 K")
     else:
@@ -273,7 +305,43 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
     return _Ground(frozenset(forms), frozenset(terms), words, tuple(untold))
 
 
-def _moves(model: Model, ground: _Ground, problem: _Problem) -> dict[str, Model]:
+def _orders_told(motion: Motion, used: np.ndarray, *, both: bool) -> set[str]:
+    """Ripple and friction of the angle: orders that the motion covers, slowly enough; once a turn a load has ripple."""
+    if motion.plateaus or not motion.placed:
+        return set()
+    span, speed = float(np.ptp(motion.position_rad[used])), np.abs(motion.velocity_radps[used])
+    found = set()
+    for order, count in _counts(motion).items():
+        of_motor = ORDERS[order][1]
+        covered = span * count / math.tau >= (_PERIODS if of_motor else _JOINT_PERIODS)
+        slow = float(np.mean(speed * count < math.tau * motion.band_Hz))
+        if not covered or slow < _LEAST_SLOW or (of_motor and motion.reduction_ratio < _PERIODS):
+            continue
+        if of_motor:  # of the joint's angle gravity and load are that
+            found.add(f"ripple-{order}")
+        if both:
+            found.add(f"angle-{order}")
+    return found
+
+
+def _worth(term: str, model: Model, vector: np.ndarray, problem: _Problem) -> bool:
+    """Whether an order of the angle may lower the held-out error: a linear fit to what the model leaves."""
+    samples, value = problem.samples, _named(model, vector)
+    assert samples.waves is not None
+    kind, order = term.split("-")
+    at = 2 * list(ORDERS).index(order)
+    columns = samples.waves[:, at : at + 2]
+    if kind == "angle":
+        columns = columns * model.friction_Nm(value, samples, model.transmitted_Nm(value, samples))[:, None]
+    left, after = problem.torque_Nm - model.torque_Nm(vector, samples), 0.0
+    for parity in (0, 1):
+        test = problem.block % 2 == parity
+        weights = np.linalg.lstsq(columns[~test], left[~test], rcond=None)[0]
+        after += float(np.sum((left[test] - columns[test] @ weights) ** 2))
+    return float(left @ left) > _WORTH**2 * after
+
+
+def _moves(model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem) -> dict[str, Model]:
     """Models with one term more than `model`."""
     found = {}
     for name in FORM_STEPS[model.form.name]:
@@ -286,6 +354,8 @@ def _moves(model: Model, ground: _Ground, problem: _Problem) -> dict[str, Model]
         if term in ("load-coulomb", "load-viscous") and not loaded:
             continue
         if term == "temperature-viscous" and not model.form.viscous:
+            continue
+        if term.startswith(("ripple-", "angle-")) and not _worth(term, model, vector, problem):
             continue
         found[term] = replace(model, terms=model.terms | {term})
     return found
@@ -303,17 +373,31 @@ def _choose(problem: _Problem, first: Model, ground: _Ground) -> tuple[Model, np
     while True:
         start = _named(model, vector)
         tried = {name: (candidate, problem.held_out_Nm(candidate, start))
-                 for name, candidate in _moves(model, ground, problem).items()}  # fmt: skip
-        least_Nm = min((error for _, error in tried.values()), default=np.inf)
-        # of terms that serve alike the first: the simpler one
-        taken = next((name for name, (_, error) in tried.items() if error <= _ALIKE * least_Nm), None)
-        if least_Nm * GAIN >= best_Nm:
-            taken = None
+                 for name, candidate in _moves(model, vector, ground, problem).items()}  # fmt: skip
+        taken, left = None, dict(tried)
+        while left and taken is None:
+            least_Nm = min(error for _, error in left.values())
+            if least_Nm * GAIN >= best_Nm:
+                break
+            # of terms that serve alike the first: the simpler one
+            taken = next(name for name, (_, error) in left.items() if error <= _ALIKE * least_Nm)
+            found = problem.fit(left[taken][0], start)
+            if _drives(left.pop(taken)[0], found):
+                taken = None
         steps += [Step(name, error, name == taken) for name, (_, error) in tried.items()]
         if taken is None:
             return model, vector, steps
         model, best_Nm = tried[taken]
-        vector = problem.fit(model, start)
+        vector = found
+
+
+def _drives(model: Model, vector: np.ndarray) -> bool:
+    """Whether the friction without load would drive the motion at some speed: a form that the data do not carry."""
+    value = _named(model, vector)
+    return any(
+        float(basis(model.form, np.linspace(0.0, 1.0, 101), ws, model.knee).dot(beta).min()) < 0.0
+        for beta, ws in (model.own(value, word) for word in model.directions)
+    )
 
 
 # --- intervals ---
@@ -377,7 +461,8 @@ def _parameters(model: Model, vector: np.ndarray, resampled: np.ndarray) -> dict
         if kind in BOUNDS:
             least = max(least, BOUNDS[kind][0])
         weak = ""
-        if max(most - value, value - least) > _WEAK * abs(value):
+        # a sine is judged with its cosine, by the held-out error
+        if max(most - value, value - least) > _WEAK * abs(value) and kind.split("_")[0] not in ("ripple", "angle"):
             zero = least <= 0.0 <= most
             weak = (
                 ("not distinguishable from 0" if zero else "hardly known") + ": " + EXPERIMENTS.get(kind, "more data")
@@ -422,8 +507,8 @@ def _repeating(motion: Motion, used: np.ndarray, error_Nm: np.ndarray, block: np
         return []
     return [
         f"{motion.torque_name}: the residual repeats with the angle (RMSE {before:.3g} Nm, {after:.3g} Nm without what "
-        "repeats): friction or ripple that depends on the position has no term here, and may lie in the others: move "
-        "over more turns of the motor, at several frequencies"
+        "repeats): friction or ripple with other periods than are looked for, or too fast for the band, may lie in the "
+        "other parameters: move slowly both ways, over several turns of the motor"
     ]
 
 
@@ -442,7 +527,7 @@ def identify_motion(
     kept = kept[kept % stride == 0]
     warm = motion.temperature_degC
     reference = None if warm is None else float(np.round(np.median(warm[used]), 1))
-    every = samples_of(motion, reference)
+    every = samples_of(motion, reference, settings)
     problem = _Problem(every.part(kept), motion.torque_Nm[kept], block[kept], settings.speed_min_radps)
     top = float(np.max(np.abs(motion.velocity_radps[used])))
     first = Model(FORMS["coulomb"], frozenset(), ground.words, top, min(knee_radps / top, 1.0))
@@ -472,5 +557,5 @@ def _check_signs(found: MotionFit) -> None:
             raise DataError(
                 f"{motion.path}: {motion.torque_name}: friction at {word} velocity would drive the motion "
                 f"({min(least_Nm, against):.3g} Nm at the joint)",
-                "the sign of torque or velocity is wrong, or the load is not what the column says",
+                "the sign of torque or velocity is wrong (--reverse), or the load is not what the column says",
             )

@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
+from jointctl.firmware_py.records import HARMONICS
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, SERIES, canvas
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.models import SIGNS, Samples, unit_of
@@ -79,7 +80,17 @@ def motion_section(found: MotionFit) -> dict[str, Any]:
         seen = np.asarray(found.motion.temperature_degC)
         ends = {"lowest_degC": round(float(seen.min()), 2), "highest_degC": round(float(seen.max()), 2)}
         values["temperature"] = {"reference_degC": found.reference_degC, **numbers, **ends}
+    waves = found.model.waves(value, "angle", found.motion.reduction_ratio)[:HARMONICS]
+    if waves:
+        values["angle"] = _wave_lists("share", waves) | (found.motion.mounting or {})
     return values
+
+
+def _wave_lists(name: str, waves: list[tuple[float, float, float]]) -> dict[str, list[float]]:
+    keys = (name, "per_motor_turn", "phase_rad")
+    return {
+        key: [float(f"{each:.6g}") for each in column] for key, column in zip(keys, np.transpose(waves), strict=True)
+    }
 
 
 def motion_remarks(found: MotionFit) -> list[str]:
@@ -96,7 +107,13 @@ def motion_remarks(found: MotionFit) -> list[str]:
     if result["gravity"] is not None:
         joint.append(f"gravity_Nm = {result['gravity']['amplitude_Nm']:.4g}")
         joint.append(f"gravity_zero_rad = {result['gravity']['zero_rad']:.4g}")
-    return [*lines, *([f"for [joint]: {', '.join(joint)}"] if joint else [])]
+    if joint:
+        lines.append(f"for [joint]: {', '.join(joint)}")
+    ripple = found.model.waves(found.value, "ripple", found.motion.reduction_ratio)[:HARMONICS]
+    if ripple:
+        keys = _wave_lists("torque_Nm", ripple) | (found.motion.mounting or {})
+        lines.append(f"for [ripple]: {', '.join(f'{key} = {each}' for key, each in keys.items())}")
+    return lines
 
 
 # --- figures ---

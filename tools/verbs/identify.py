@@ -40,33 +40,59 @@ class TableOptions:
     """How to read a table that is not ours; a field of `ForeignFormat` each."""
 
     velocity_column: Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")] = None
-    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column (Nm)")] = None
-    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column (A)")] = (
-        None
-    )
-    velocity_unit: Annotated[str | None, typer.Option("--velocity-unit", help="deg/s, rad/s or r/min")] = None
-    side: Annotated[str | None, typer.Option("--side", help="of the velocity: joint or motor")] = None
+    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column")] = None
+    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column")] = None
+    velocity_unit: Annotated[
+        str | None, typer.Option("--velocity-unit", help="deg/s, rad/s, r/min, turn/s or count/s")
+    ] = None
+    side: Annotated[str | None, typer.Option("--side", help="of velocity and position: joint or motor")] = None
     torque_side: Annotated[str | None, typer.Option("--torque-side", help="motor or joint")] = None
+    torque_unit: Annotated[str, typer.Option("--torque-unit", help="Nm, Ncm or mNm")] = "Nm"
+    current_unit: Annotated[str, typer.Option("--current-unit", help="A or mA")] = "A"
     ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
     torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
+    counts_per_turn: Annotated[
+        float | None, typer.Option("--counts-per-turn", help="of the shaft that is counted, for the unit count")
+    ] = None
+    reverse: Annotated[
+        list[str] | None,
+        typer.Option("--reverse", help="position, velocity, torque or load: the other sign; may be repeated"),
+    ] = None
+    where: Annotated[
+        list[str] | None,
+        typer.Option("--where", metavar="COLUMN=VALUE", help="only such lines, as of one joint; may be repeated"),
+    ] = None
     delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
     time_column: Annotated[
-        str | None, typer.Option("--time-column", help="name of the time column (s): the table is a motion in time")
+        str | None, typer.Option("--time-column", help="name of the time column: the table is a motion in time")
+    ] = None
+    time_unit: Annotated[str, typer.Option("--time-unit", help="s, ms, us or ns")] = "s"
+    sample_rate_Hz: Annotated[
+        float | None, typer.Option("--sample-rate", help="samples a second, in place of a column of time")
+    ] = None
+    motion_column: Annotated[
+        str | None,
+        typer.Option("--motion-column", help="column that changes from one motion to the next, or time that goes back"),
     ] = None
     position_column: Annotated[str | None, typer.Option("--position-column", help="name of the position column")] = None
-    position_unit: Annotated[str | None, typer.Option("--position-unit", help="rad, deg or turn")] = None
+    position_unit: Annotated[str | None, typer.Option("--position-unit", help="rad, deg, turn or count")] = None
+    position_side: Annotated[
+        str | None, typer.Option("--position-side", help="where it is not that of the velocity: joint or motor")
+    ] = None
     load_column: Annotated[
         str | None, typer.Option("--load-column", help="name of the column of the known load's torque (joint, Nm)")
     ] = None
     temperature_column: Annotated[
-        str | None, typer.Option("--temperature-column", help="name of the temperature column (degC)")
+        str | None, typer.Option("--temperature-column", help="name of the temperature column")
     ] = None
+    temperature_unit: Annotated[str, typer.Option("--temperature-unit", help="degC, K or degF")] = "degC"
 
 
 def _given_format(table: TableOptions) -> ForeignFormat:
     from jointctl.tools.identification.friction_data import ForeignFormat
 
-    return ForeignFormat(**vars(table))
+    lists = {"reverse": table.reverse or (), "where": table.where or ()}
+    return ForeignFormat(**{**vars(table), **lists})
 
 
 GivenFormat = Annotated["ForeignFormat | None", _given_format]
@@ -327,15 +353,18 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
         joined,
         motion_of_log,
         motion_of_plateaus,
-        read_motion,
     )
+    from jointctl.tools.identification.motion_table import read_motion
     from jointctl.tools.recording.run_log_reader import read_run_log
 
     def one(path: Path) -> Motion:
         if path.suffix.lower() == ".mcap":
             return motion_of_log(path, read_run_log(path), given, settings)
         if not is_series(path, given):
-            raise DataError(f"{path}: is no motion in time", "--also is for run logs, and tables with --time-column")
+            raise DataError(
+                f"{path}: is no motion in time",
+                "--also is for run logs, and tables with --time-column or --sample-rate",
+            )
         return read_motion(path, given, settings)
 
     plateaus = motion_of_plateaus(path, given)

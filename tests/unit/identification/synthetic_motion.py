@@ -8,7 +8,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from jointctl.tools.identification.friction_data import ForeignFormat
-from jointctl.tools.identification.motion_data import MotionSettings, read_motion
+from jointctl.tools.identification.motion_data import MotionSettings
+from jointctl.tools.identification.motion_table import read_motion
 
 RATIO = 100.0
 FORMAT = ForeignFormat(

@@ -21,8 +21,10 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.models import FORMS
-from jointctl.tools.identification.motion_data import Motion, MotionSettings, joined, motion_of_plateaus, read_motion
+from jointctl.tools.identification.motion_data import Motion, MotionSettings, joined, motion_of_plateaus
 from jointctl.tools.identification.motion_fit import MotionFit, identify_motion
+from jointctl.tools.identification.motion_report import motion_remarks, motion_section
+from jointctl.tools.identification.motion_table import read_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.sweeping.data_file import SweepFile
@@ -497,3 +499,53 @@ def test_five_real_strain_wave_joints_on_held_out_blocks(number, most_Nm):
     if number in (4, 6):  # under gravity load
         assert found.model.terms & {"load-scale", "load-coulomb"}
         assert "one direction only cannot tell load friction from an error of the torque constant" in text
+
+
+# --- ripple, and friction that goes with the angle ---
+
+
+def slow_strokes(share, ripple_Nm, seconds=60.0):
+    """Slow motion both ways over several motor turns; friction times 1 + share, and a torque besides."""
+    t = np.arange(0.0, seconds, 0.005)
+    w = 2.0 * np.pi / 20.0
+    q = 0.9 * np.sin(w * t) + 0.06 * np.sin(7.3 * w * t)
+    v, a = np.gradient(q, t), np.gradient(np.gradient(q, t), t)
+    joint = TrueJoint()
+    tau = joint.inertia_kgm2 * a + joint.gravity_Nm * np.sin(q - joint.gravity_zero_rad)
+    friction = joint.torque_Nm(q, v, a) - tau
+    noise = 0.2 * np.random.default_rng(3).standard_normal(len(t))
+    return {"t": t, "q": q, "tau": tau + friction * (1.0 + share(q)) - ripple_Nm(q) + noise}
+
+
+SLOW = replace(SETTINGS, speed_min_radps=0.02)
+
+
+def test_friction_that_turns_round_with_the_motion_is_told_from_ripple(tmp_path):
+    columns = slow_strokes(lambda q: 0.12 * np.sin(2.0 * RATIO * q + 0.7), lambda q: 0.6 * np.sin(RATIO * q + 1.1))
+    found = identify_motion(read(tmp_path / "slow.csv", columns, SLOW), SLOW)
+    (friction,) = found.model.waves(found.value, "angle", RATIO)
+    (ripple,) = found.model.waves(found.value, "ripple", RATIO)
+    assert friction == pytest.approx((0.12, 2.0, 0.7), rel=0.05)
+    assert ripple == pytest.approx((0.6, 1.0, 1.1), rel=0.05)
+    assert found.rmse_Nm(odd=True) < 0.12
+    section = motion_section(found)
+    assert section["angle"]["share"] == [pytest.approx(0.12, rel=0.05)]
+    assert section["angle"]["per_motor_turn"] == [2.0]
+    assert any(line.startswith("for [ripple]: torque_Nm = [0.") for line in motion_remarks(found))
+
+
+def test_a_joint_without_them_gets_none(tmp_path):
+    columns = slow_strokes(lambda q: 0.0, lambda q: 0.0 * q)
+    found = identify_motion(read(tmp_path / "slow.csv", columns, SLOW), SLOW)
+    assert not [term for term in found.model.terms if term.startswith(("angle-", "ripple-"))]
+    assert "angle" not in motion_section(found)
+
+
+def test_one_way_alone_tells_no_friction_of_the_angle(tmp_path):
+    t = np.arange(0.0, 60.0, 0.005)
+    q = 0.03 * t + 0.01 * np.sin(0.7 * t)
+    tau = 5.0 * (1.0 + 0.2 * np.sin(2.0 * RATIO * q)) + 0.2 * np.random.default_rng(3).standard_normal(len(t))
+    settings = replace(SETTINGS, speed_min_radps=0.01)
+    found = identify_motion(read(tmp_path / "way.csv", {"t": t, "q": q, "tau": tau}, settings), settings)
+    assert "ripple-m2" in found.model.terms
+    assert not [term for term in found.model.terms if term.startswith("angle-")]
