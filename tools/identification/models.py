@@ -168,8 +168,8 @@ def branch(form: Form, beta: np.ndarray, ws: float, knee: float, top_radps: floa
 #     V = (11) less its Coulomb and Stribeck part + kv |tau| |v|        fv = exp(-bv (T - T0))
 #
 # tc, ts, ws and V belong to a direction, the rest to both.  r and f are sines of the motor's angle (1, 2 and 4 a turn)
-# and of the joint's (1 and 2): ripple, which goes with the angle alone, and the share of the friction that goes with the
-# angle and turns round with the motion.  Both pass through the filter of the torque.
+# and of the joint's (1 and 2): ripple, which goes with the angle alone, and the share of the friction that goes with
+# the angle and turns round with the motion.  Both pass through the filter of the torque.
 # Friction that goes with |tau| and always opposes the motion
 # is that of the load-dependent models of Rhoban's BAM; beside it, a gear that loses more in one direction of power than
 # in the other looks like an error s of the known load, as sign(v) |tau| and tau span both.  Not modelled: hysteresis,

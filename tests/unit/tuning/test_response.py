@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,9 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
+from jointctl.tools.configuration.conversions import static_friction_Nm
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.tuning.excitation import (
     ResponsePlan,
     config_of_response,
@@ -24,8 +28,9 @@ from jointctl.tools.tuning.excitation import (
     room_rad,
     speed_and_period,
 )
+from jointctl.tools.tuning.found_values import with_break_away, without_friction
 from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
-from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, gravity_of
+from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, fitted_again, gravity_of
 from tests.configurations import shipped
 
 T = 1e-3
@@ -214,3 +219,32 @@ def test_a_response_without_coherence_gives_no_model() -> None:
     blind = Channel(found.motor.response, found.motor.half, np.full(len(found.frequency_Hz), 0.1))
     with pytest.raises(DataError, match=r"lines with coherence \(=0\) must be at least 12"):
         fit_joint(FrequencyResponse(found.frequency_Hz, blind, None, 12, 5.0, T), 2.0)
+
+
+@pytest.mark.parametrize("joint", [SOFT, RIGID])
+def test_another_response_says_what_the_joint_weighs_now(joint: TwoMasses) -> None:
+    """From where the first fit ended: the same joint, and one with a payload."""
+    late = (1e-3, 5e-4)
+    fit = fit_joint(made_response(joint, late, motor=joint is SOFT), 2.0)
+    for payload in (0.0, 0.5):
+        loaded = (
+            replace(joint, link_kgm2=joint.link_kgm2 + payload) if joint is SOFT
+            else replace(joint, motor_kgm2=joint.motor_kgm2 + payload)
+        )  # fmt: skip
+        whole = loaded.motor_kgm2 + (loaded.link_kgm2 if joint is SOFT else 0.0)
+        again = fitted_again(made_response(loaded, late, seed=2, motor=joint is SOFT), fit)
+        assert again.value == pytest.approx(whole, rel=0.02)
+        assert again.half > 0.02 * whole  # what friction adds
+
+
+def test_before_the_friction_is_known_the_reading_is_watched_by_what_moved_the_joint() -> None:
+    config = with_break_away(shipped("precise"), 20.0)
+    assert config.control.feed_forward == "none"
+    assert static_friction_Nm(config) == pytest.approx(20.0)
+    limits = axis_constants(config, np.zeros((2, 5)))[0].limits
+    assert limits.frozen_torque_Nm == pytest.approx(30.0)
+    assert plant_settings(config) == plant_settings(shipped("precise"))  # the joint itself is what it was
+    moving = config_of_response(config, None)
+    assert moving.control.feed_forward == "none"
+    assert config_of_response(shipped("precise"), None).control.feed_forward == "desired"
+    assert axis_constants(without_friction(config), np.zeros((2, 5)))[0].limits.frozen_torque_Nm == 0.0
