@@ -11,6 +11,7 @@ from jointctl.firmware_py.schema import array_of, f8, i4, i8, record
 BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
 RIPPLES = 2  # sines of the motor angle that it finds
 ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
+FED_HISTORY = 16  # cycles for which what was fed forward is kept
 
 
 @record
@@ -69,6 +70,7 @@ class AdaptationConstants:
     enabled: i4
     ripples: i4  # sines in use
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
+    late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
@@ -85,6 +87,8 @@ class AdaptationState:
     deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # as measured
     bristle: LuGreConstants  # of one kind of bristles, while they are computed
     fed_filtered_Nm: f8
+    fed_Nm: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
+    newest: i4  # in it
     rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
     resting: i4
     cycle: i4

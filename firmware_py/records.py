@@ -68,6 +68,8 @@ class ObserverState:
     newest: i8
     sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
     known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
+    known_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]  # friction, gravity and what is learned, of each
+    speed_radps: f8  # average of the desired one
     # the Kalman filter alone
     primed: i4  # 0 until the first reading
     error_rad: f8
@@ -184,7 +186,7 @@ class LawConstants:
     learning: LearningConstants
     flexible: FlexibleConstants
     adaptation: AdaptationConstants
-    feed_forward_lead_s: f8  # friction is fed forward for the motion that is desired so much later
+    feed_forward_lead_s: f8  # friction and inertia are fed forward for the motion that is desired so much later
     of_arm: i4  # gravity and Coriolis torque are the arm's, `LawState.arm_torque_Nm`
 
 

@@ -206,16 +206,18 @@ def test_no_distance_is_rest_and_not_a_division_by_zero(kind):
         (TrajectoryKind.MIN_JERK, {"start_rad": -0.2, "target_rad": 0.5, "move_s": 1.3}),
     ],
 )
-def test_the_fourth_derivative_is_that_of_the_acceleration_twice(kind, values):
+def test_jerk_and_fourth_derivative_are_those_of_the_acceleration(kind, values):
     c, reference, step_s = constants(kind, **values), new(Reference)[0], 1e-4
     for t_s in (0.2, 0.65, 1.1):
         around = [at(c, t_s + k * step_s)[2] for k in (-1, 0, 1)]
         reference_at(c, NO_TABLE, 0, t_s, reference)
         expected = (around[0] - 2.0 * around[1] + around[2]) / step_s**2
         assert reference.snap_radps4 == pytest.approx(expected, rel=1e-3, abs=1e-3)
+        slope = (around[2] - around[0]) / (2.0 * step_s)
+        assert reference.jerk_radps3 == pytest.approx(slope, rel=1e-5, abs=1e-5)
 
 
-def test_the_fourth_derivative_of_an_approach_and_of_rest():
+def test_jerk_and_fourth_derivative_of_an_approach_and_of_rest():
     reference, coefficients, step_s = new(Reference)[0], np.zeros(6), 1e-4
     reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 0.6, 0.2, -1.0
     plan_approach(0.1, reference, 2.0, coefficients)
@@ -225,11 +227,12 @@ def test_the_fourth_derivative_of_an_approach_and_of_rest():
         around.append(float(reference.acceleration_radps2))
     approach_at(coefficients, 0.7, reference)
     assert reference.snap_radps4 == pytest.approx((around[0] - 2.0 * around[1] + around[2]) / step_s**2, rel=1e-3)
+    assert reference.jerk_radps3 == pytest.approx((around[2] - around[0]) / (2.0 * step_s), rel=1e-5)
     brake_step(reference, 1.0, 1e-3)
-    assert reference.snap_radps4 == 0.0
+    assert reference.snap_radps4 == reference.jerk_radps3 == 0.0
     approach_at(coefficients, 0.7, reference)
     reference_at(constants(TrajectoryKind.HOLD, start_rad=0.3), NO_TABLE, 0, 1.0, reference)
-    assert reference.snap_radps4 == 0.0
+    assert reference.snap_radps4 == reference.jerk_radps3 == 0.0
 
 
 @quick
