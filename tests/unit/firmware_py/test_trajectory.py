@@ -281,7 +281,7 @@ def test_brake_lands_on_exactly_zero_within_the_deceleration(position, velocity,
     assert abs(float(reference.position_rad) - ideal) <= brake * period_s**2
     resting = float(reference.position_rad)
     brake_step(reference, brake, period_s)
-    assert reference.tolist() == (resting, 0.0, 0.0, 0.0)
+    assert reference.tolist() == (resting, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_a_brake_that_is_not_positive_stops_at_once():
@@ -289,7 +289,7 @@ def test_a_brake_that_is_not_positive_stops_at_once():
         reference = new(Reference)[0]
         reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 1.0, 2.0, 3.0
         brake_step(reference, brake, 1e-3)
-        assert reference.tolist() == (1.0, 0.0, 0.0, 0.0)
+        assert reference.tolist() == (1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # --- Tables from CSV, the demands of a trajectory, the duration of an approach; compiled and plain runs agree ---
@@ -507,7 +507,8 @@ for kind in range(4):
             step_plant(pc[0], ps[0], 40.0 if k < 200 else -55.0)
         s = ps[0]
         out.append([encoder_counts(pc[0], s), float(s.joint_position_rad), float(s.joint_velocity_radps),
-                    float(s.friction_torque_Nm), float(s.motor_position_rad)])
+                    float(s.friction_torque_Nm), float(s.motor_position_rad),
+                    float(s.actuator_torque_Nm)])
 print(json.dumps(out))
 """
 
@@ -517,5 +518,5 @@ def test_compiled_and_plain_python_agree():
         np.array(json.loads(run_python(_BOTH_WAYS, NUMBA_DISABLE_JIT=disabled, PYTHONWARNINGS="error")))
         for disabled in ("0", "1")
     )
-    assert compiled.shape == (238, 5)
+    assert compiled.shape == (238, 6)
     assert plain == pytest.approx(compiled, rel=1e-9, abs=1e-12)
