@@ -187,7 +187,8 @@ def newton_euler(arm: Arm) -> None:
 def feed_arm(arm: Arm, constants: np.ndarray, states: np.ndarray) -> None:
     """For each law what the arm asks of its joint beyond the joint's own inertia: `LawState.arm_torque_Nm`.
 
-    Where an axis follows no reference the joint counts as resting where it was measured.
+    Of the motion desired `feed_forward_lead_s` later.  Where an axis follows no reference the joint counts as resting
+    where it was measured.
     """
     kind = arm.constants[0].feed_forward
     if kind == ArmFeedForward.NONE:
@@ -197,10 +198,14 @@ def feed_arm(arm: Arm, constants: np.ndarray, states: np.ndarray) -> None:
         own: ArmMotion = arm.motion[axis]
         own.velocity_radps = own.acceleration_radps2 = 0.0
         if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
-            own.position_rad = state.reference.position_rad
+            one: AxisConstants = constants[axis]
+            desired = state.reference
+            lead_s = one.law.feed_forward_lead_s
+            mean_radps = desired.velocity_radps + 0.5 * lead_s * desired.acceleration_radps2
+            own.position_rad = desired.position_rad + lead_s * mean_radps
             if kind == ArmFeedForward.WHOLE:
-                own.velocity_radps = state.reference.velocity_radps
-                own.acceleration_radps2 = state.reference.acceleration_radps2
+                own.velocity_radps = desired.velocity_radps + lead_s * desired.acceleration_radps2
+                own.acceleration_radps2 = desired.acceleration_radps2 + lead_s * desired.jerk_radps3
         else:
             own.position_rad = state.measured_position_rad
     newton_euler(arm)

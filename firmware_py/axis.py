@@ -402,6 +402,7 @@ def look_ahead(reference: Reference, lead_s: float, ahead: Reference) -> None:
     )
     ahead.velocity_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
     ahead.acceleration_radps2 = reference.acceleration_radps2
+    ahead.jerk_radps3 = reference.jerk_radps3
     ahead.snap_radps4 = reference.snap_radps4
 
 

@@ -65,6 +65,9 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState) -> 
     state.fed_filtered_Nm = 0.0
     state.resting = 0
     state.cycle = 0
+    state.newest = 0
+    for i in range(len(state.fed_Nm)):
+        state.fed_Nm[i] = 0.0
 
 
 @kernel
@@ -117,6 +120,16 @@ def take_at_rest(law: LawConstants, state: AdaptationState, disturbance_Nm: floa
         state.desired_deflection_rad[k] = after / stiffness
         state.deflection_rad[k] = after / stiffness
     return taken
+
+
+@kernel
+def fed_before_Nm(law: LawConstants, state: AdaptationState, fed_Nm: float) -> float:
+    """What was fed forward `late_cycles` ago, which takes note of what is fed forward now."""
+    size = len(state.fed_Nm)
+    state.newest = (state.newest + 1) % size
+    state.fed_Nm[state.newest] = fed_Nm
+    late = min(max(law.adaptation.late_cycles, 0), size - 1)
+    return state.fed_Nm[(state.newest - late + size) % size]
 
 
 @kernel

@@ -14,7 +14,13 @@ from jointctl.firmware_py.flexible_joint import (
     value_at,
 )
 from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
-from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
+from jointctl.firmware_py.friction_adaptation import (
+    adapt,
+    adapted_feed_forward_Nm,
+    fed_before_Nm,
+    reset_adaptation,
+    take_at_rest,
+)
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import (
@@ -151,7 +157,13 @@ def adapt_network(
 # `r` [Nm at the joint] follows minus the unknown torque with bandwidth L [rad/s]; the law adds it with the sign that
 # cancels.  No acceleration is differentiated.  The applied torque is the one that was sent, limited, as many cycles
 # ago as a command needs to become torque, so that saturation does not wind the observer up.  `known` is that of this
-# cycle, or, `paired`, that of the same command: then friction fed forward ahead of the motion is no disturbance.
+# cycle, or, `paired`, that of the same command: then friction fed forward ahead of the motion is no disturbance.  While
+# the joint hardly moves (the average of the desired speed over AVERAGE_s is below PAIRED_FROM_radps) the other way is
+# the better one all the same: bristles load up over a distance, and a joint that sticks breaks loose with less torque.
+
+
+AVERAGE_s = 0.1
+PAIRED_FROM_radps = 0.005
 
 
 @kernel
@@ -162,7 +174,9 @@ def reset_observer(state: ObserverState, momentum_Nms: float) -> None:
     state.newest = 0
     state.primed = 0
     state.known_torque_Nm = 0.0
+    state.speed_radps = 0.0
     for i in range(TORQUE_HISTORY):
+        state.known_Nm[i] = 0.0
         state.sent_torque_Nm[i] = 0.0
 
 
@@ -173,6 +187,18 @@ def applied_torque_Nm(constants: ObserverConstants, state: ObserverState, sent_t
     state.sent_torque_Nm[state.newest] = sent_torque_Nm
     delay = min(max(constants.delay_cycles, 0), TORQUE_HISTORY - 1)
     return state.sent_torque_Nm[(state.newest - delay + TORQUE_HISTORY) % TORQUE_HISTORY]
+
+
+@kernel
+def known_since_Nm(constants: ObserverConstants, state: ObserverState, known_Nm: float) -> float:
+    """What a paired observer that is not to be paired leaves to the model [Nm]: the change of what was fed forward
+    between the command that is at work and this cycle.  Call it before `step_observer`."""
+    at = (state.newest + 1) % TORQUE_HISTORY
+    state.known_Nm[at] = known_Nm
+    if state.speed_radps >= PAIRED_FROM_radps:
+        return 0.0
+    late = min(max(constants.delay_cycles, 0) + 1, TORQUE_HISTORY - 1)
+    return known_Nm - state.known_Nm[(at - late + TORQUE_HISTORY) % TORQUE_HISTORY]
 
 
 @kernel
@@ -204,6 +230,7 @@ def add_to_disturbance(constants: ObserverConstants, state: ObserverState, torqu
         if constants.paired != 0:  # as if it had been the observer's in the commands that are no torque yet, too
             for i in range(TORQUE_HISTORY):
                 state.sent_torque_Nm[i] += torque_Nm
+                state.known_Nm[i] -= torque_Nm
 
 
 # --- Iterative learning for trajectories that repeat: the torque that feedback had to add is fed forward next time ---
@@ -426,7 +453,7 @@ def _adapt(
     state.friction_torque_Nm += taken_Nm
     add_to_disturbance(constants.observer, state.observer, -taken_Nm)
     state.observer_torque_Nm = state.observer.disturbance_Nm
-    fed_Nm = state.friction_torque_Nm + state.learned_torque_Nm
+    fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
     adapt(
         constants, state.adaptation, state.observer_torque_Nm, fed_Nm, desired_radps, position_rad,
         desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
@@ -465,10 +492,11 @@ def _rest_torque_Nm(
         return state.observer_torque_Nm
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         known = state.friction_torque_Nm + state.gravity_torque_Nm + state.learned_torque_Nm
-        if constants.observer.paired != 0:
-            sent_Nm -= state.observer.known_torque_Nm
-            known = 0.0
         momentum = constants.inertia_kgm2 * velocity_radps
+        if constants.observer.paired != 0:
+            momentum = constants.inertia_kgm2 * error_rate
+            sent_Nm -= state.observer.known_torque_Nm
+            known = known_since_Nm(constants.observer, state.observer, known)
         state.observer_torque_Nm = step_observer(
             constants.observer, state.observer, sent_Nm, known, momentum, constants.period_s
         )
@@ -511,7 +539,9 @@ def step_law(
         error_rate = velocity.error_rate_radps
     else:
         error_rate = velocity.velocity_radps - reference.velocity_radps
-    state.inertia_torque_Nm = constants.inertia_kgm2 * reference.acceleration_radps2
+    lead_s = constants.feed_forward_lead_s
+    ahead_radps2 = reference.acceleration_radps2 + lead_s * reference.jerk_radps3
+    state.inertia_torque_Nm = constants.inertia_kgm2 * ahead_radps2
     proportional_Nm = -constants.inertia_kgm2 * (constants.kv * error_rate + constants.kp * error)
     state.feedback_torque_Nm = proportional_Nm
     if constants.of_arm != 0:
@@ -526,6 +556,8 @@ def step_law(
     )
     ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
     state.friction_torque_Nm -= value_at(constants.flexible.torque_ripple, ahead_rad)
+    faster_radps = abs(reference.velocity_radps) - state.observer.speed_radps
+    state.observer.speed_radps += constants.period_s / AVERAGE_s * faster_radps
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity_radps, sent_torque_Nm)
     if constants.adaptation.enabled != 0:
         _adapt(constants, state, reference.velocity_radps, position_rad, error_rate, transmitted_Nm)
@@ -535,8 +567,6 @@ def step_law(
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         rest_Nm = state.observer_torque_Nm
     known_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm + state.learned_torque_Nm
-    if constants.observer.paired != 0:
-        known_Nm -= state.inertia_torque_Nm  # its momentum is that of the whole motion
     state.observer.known_torque_Nm = known_Nm
     return (
         state.inertia_torque_Nm

@@ -15,6 +15,7 @@ class Reference:
     position_rad: f8
     velocity_radps: f8
     acceleration_radps2: f8
+    jerk_radps3: f8  # 0 where the motion has jumps of acceleration, or where it is not known
     snap_radps4: f8  # fourth derivative; 0 where the motion has jumps in it, or where it is not known
 
 

@@ -17,6 +17,7 @@ BRISTLES = 4  # of different stiffness, that the adaptation of the friction weig
 RIPPLES = 2  # sines of the motor angle that it finds
 ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
 HARMONICS = 4  # of a series of the motor angle
+FED_HISTORY = 16  # cycles for which what was fed forward is kept
 
 
 @record
@@ -86,6 +87,7 @@ class AdaptationConstants:
     enabled: i4
     ripples: i4  # sines in use
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
+    late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
@@ -102,6 +104,8 @@ class AdaptationState:
     deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # as measured
     bristle: LuGreConstants  # of one kind of bristles, while they are computed
     fed_filtered_Nm: f8
+    fed_Nm: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
+    newest: i4  # in it
     rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
     resting: i4
     cycle: i4
@@ -157,6 +161,8 @@ class ObserverState:
     newest: i8
     sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
     known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
+    known_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]  # friction, gravity and what is learned, of each
+    speed_radps: f8  # average of the desired one
     # the Kalman filter alone
     primed: i4  # 0 until the first reading
     error_rad: f8
@@ -263,7 +269,7 @@ class LawConstants:
     learning: LearningConstants
     flexible: FlexibleConstants
     adaptation: AdaptationConstants
-    feed_forward_lead_s: f8  # friction is fed forward for the motion that is desired so much later
+    feed_forward_lead_s: f8  # friction and inertia are fed forward for the motion that is desired so much later
     of_arm: i4  # gravity and Coriolis torque are the arm's, `LawState.arm_torque_Nm`
 
 

@@ -65,6 +65,7 @@ def between(before: SetPoint, after: SetPoint, time_ns: int, reference: Referenc
     given = before.acceleration_radps2 + share * (after.acceleration_radps2 - before.acceleration_radps2)
     mean = (after.velocity_radps - before.velocity_radps) / duration_s
     reference.acceleration_radps2 = mean if math.isnan(given) else given
+    reference.jerk_radps3 = 0.0
     reference.snap_radps4 = 0.0
     return before.torque_Nm + share * (after.torque_Nm - before.torque_Nm)
 

@@ -41,6 +41,7 @@ def _rest_at(position_rad: float, reference: Reference) -> None:
     reference.position_rad = position_rad
     reference.velocity_radps = 0.0
     reference.acceleration_radps2 = 0.0
+    reference.jerk_radps3 = 0.0
     reference.snap_radps4 = 0.0
 
 
@@ -55,6 +56,7 @@ def _sine_at(c: TrajectoryConstants, t_s: float, reference: Reference) -> None:
     reference.position_rad = offset + swing
     reference.velocity_radps = amplitude * omega * math.cos(angle)
     reference.acceleration_radps2 = -omega * omega * swing
+    reference.jerk_radps3 = -omega * omega * reference.velocity_radps
     reference.snap_radps4 = omega * omega * omega * omega * swing
 
 
@@ -66,6 +68,7 @@ def _min_jerk_move(distance_rad: float, move_s: float, t_s: float, reference: Re
     reference.position_rad = distance_rad * u * u * u * (10.0 + u * (-15.0 + 6.0 * u))
     reference.velocity_radps = rate * u * u * (30.0 + u * (-60.0 + 30.0 * u))
     reference.acceleration_radps2 = rate / move_s * u * (60.0 + u * (-180.0 + 120.0 * u))
+    reference.jerk_radps3 = rate / (move_s * move_s) * (60.0 + u * (-360.0 + 360.0 * u))
     reference.snap_radps4 = rate / (move_s * move_s * move_s) * (-360.0 + 720.0 * u)
 
 
@@ -84,6 +87,7 @@ def _trapezoid_move(
 ) -> None:
     """From 0 to `distance_rad` (either sign) for 0 <= t <= 2 ramp_s + cruise_s."""
     acceleration = math.copysign(acceleration_radps2, distance_rad)
+    reference.jerk_radps3 = 0.0
     reference.snap_radps4 = 0.0
     speed = acceleration * ramp_s
     left_s = 2.0 * ramp_s + cruise_s - t_s
@@ -218,6 +222,7 @@ def _table_at(c: TrajectoryConstants, table: np.ndarray, row_hint: int, t_s: flo
     reference.position_rad = table[row, 1] + d * (c1 + d * (c2 + d * c3))
     reference.velocity_radps = c1 + d * (2.0 * c2 + d * 3.0 * c3)
     reference.acceleration_radps2 = 2.0 * c2 + 6.0 * c3 * d
+    reference.jerk_radps3 = 6.0 * c3
     reference.snap_radps4 = 0.0
     return row
 
@@ -273,6 +278,7 @@ def approach_at(coefficients: np.ndarray, t_s: float, reference: Reference) -> N
     reference.position_rad = a[0] + t * (a[1] + t * (a[2] + t * (a[3] + t * (a[4] + t * a[5]))))
     reference.velocity_radps = a[1] + t * (2.0 * a[2] + t * (3.0 * a[3] + t * (4.0 * a[4] + t * 5.0 * a[5])))
     reference.acceleration_radps2 = 2.0 * a[2] + t * (6.0 * a[3] + t * (12.0 * a[4] + t * 20.0 * a[5]))
+    reference.jerk_radps3 = 6.0 * a[3] + t * (24.0 * a[4] + t * 60.0 * a[5])
     reference.snap_radps4 = 24.0 * a[4] + t * 120.0 * a[5]
 
 
@@ -306,6 +312,7 @@ def brake_step(reference: Reference, brake_radps2: float, period_s: float) -> No
     reference.position_rad += 0.5 * (velocity + next_velocity) * period_s
     reference.velocity_radps = next_velocity
     reference.acceleration_radps2 = acceleration
+    reference.jerk_radps3 = 0.0
     reference.snap_radps4 = 0.0
 
 

@@ -32,7 +32,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from jointctl.tools.analysis.loop_settings import loop_settings  # noqa: E402
+from jointctl.tools.analysis.linear_loop import loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import joint_rad_per_count  # noqa: E402

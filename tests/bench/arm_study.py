@@ -1,13 +1,14 @@
 """What an arm's model buys: random simulated arms of three joints under the gains of `precise`, without learning.
 
-    python -m tests.bench.arm_study [arms] [seed] [picture.png]
+    python -m tests.bench.arm_study [arms] [seed] [picture.png or -] [part]...
 
 Each arm is the shipped one with joints drawn as `jointctl study` draws them (friction +-10 % a direction, ripples, lag,
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does, and
-without observer and adaptation, computed torque alone.
+whole model; then all of it again with an observer that is paired and a lead that is that of each joint, with friction
+that the controller knows, which leaves what the arm itself does, and without observer and adaptation, computed torque
+alone.  Of the parts all are run, or those that are named.
 Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
@@ -40,14 +41,19 @@ KINDS = {
     "whole model": ArmFeedForward.WHOLE,
 }  # fmt: skip
 PARTS: dict[str, dict[str, bool]] = {
-    "friction as in study": {}, "friction as believed": {"known": True}, "without observer": {"observer": False},
+    "friction as in study": {}, "paired observer": {"paired": True}, "friction as believed": {"known": True},
+    "and paired observer": {"known": True, "paired": True}, "without observer": {"observer": False},
 }  # fmt: skip
 
 
-def random_arm(arm: ArmConfig, seed: int, index: int, *, known: bool = False, observer: bool = True) -> ArmConfig:
+def random_arm(
+    arm: ArmConfig, seed: int, index: int, *, known: bool = False, observer: bool = True,
+    paired: bool = False,
+) -> ArmConfig:  # fmt: skip
     """Arm number `index` of the study with this seed.
 
     `known`: its friction is the believed one, without ripples.  Without `observer` the law is computed torque alone.
+    `paired`: the observer is, and the feed-forward leads by each joint's own delay and lag.
     """
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
@@ -65,6 +71,9 @@ def random_arm(arm: ArmConfig, seed: int, index: int, *, known: bool = False, ob
         if not observer:
             alone = {"kind": "computed_torque", "observer_radps": 0.0, "adaptation": None}
             config = config.model_copy(update={"control": config.control.model_copy(update=alone)})
+        if paired:
+            better = {"observer_paired": True, "feed_forward_lead_s": "auto"}
+            config = config.model_copy(update={"control": config.control.model_copy(update=better)})
         drawn = random_plant(config, ensemble, seed, 100 * index + number)
         assert drawn.virtual is not None
         crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
@@ -157,7 +166,9 @@ def picture(path: Path) -> None:
 if __name__ == "__main__":
     count, chosen = (int(text) for text in (sys.argv[1:3] + ["20", "1"][len(sys.argv[1:3]) :]))
     for heading, how in PARTS.items():
+        if heading not in (sys.argv[4:] or PARTS):
+            continue
         print(f"\n{heading}, {count} arms, seed {chosen}\n")
         print("\n".join(table(study(count, chosen, how), load_arm(SHIPPED_ARM).names)), flush=True)
-    if len(sys.argv) > 3:
+    if len(sys.argv) > 3 and sys.argv[3] != "-":
         picture(Path(sys.argv[3]))

@@ -165,11 +165,7 @@ def _control_problems(config: Config) -> list[str]:
             'control.velocity_filter (=kalman) needs control.kind "computed_torque_observer" '
             f"(={control.kind}) and control.velocity_cutoff_Hz above 0 (={control.velocity_cutoff_Hz:g})"
         )
-    if control.observer_paired and (
-        control.kind != "computed_torque_observer"
-        or control.velocity_filter == "kalman"
-        or control.adaptation is not None
-    ):
+    if control.observer_paired and (control.kind != "computed_torque_observer" or control.velocity_filter == "kalman"):
         found.append(
             'control.observer_paired (=true) needs control.kind "computed_torque_observer" '
             f'(={control.kind}) with control.velocity_filter "low_pass" (={control.velocity_filter}), '

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
 from jointctl.firmware_py.records import NEURONS, RIPPLES
-from jointctl.tools.configuration.sections import Rule, Section, between, is_number, numbers
+from jointctl.tools.configuration.sections import Rule, Section, auto_or_number, between, is_number, numbers
 
 CENTRES = "15 numbers or 15 pairs [rad, rad/s], each in [-100..100]"
 
@@ -86,7 +86,7 @@ class Control(Section):
     # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
     twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0
     link_cutoff_Hz: Annotated[float, between(0.0, 2000.0)] = 60.0  # of the link's velocity there; 0 = no filter
-    # of the friction: the motion desired so much later, as torque is late by delay and lag
-    feed_forward_lead_s: Annotated[float, between(0.0, 0.02)] = 0.0
+    # of friction and inertia: the motion desired so much later, as torque is late; auto: loop delay, half a period, lag
+    feed_forward_lead_s: Annotated[float | Literal["auto"], auto_or_number(0.0, 0.02)] = 0.0
     adaptation: Adaptation | None = None
     learning: Learning | None = None

@@ -14,6 +14,7 @@ from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.motion_records import ChangeConstants, Gains, TrajectoryConstants
 from jointctl.firmware_py.records import (
+    FED_HISTORY,
     NEURONS,
     AdaptationConstants,
     AxisConstants,
@@ -169,9 +170,12 @@ def _fill_law(law: LawConstants, config: Config) -> None:
         _copy(law.learning, control.learning, "gain", "error_gain_ps2", "lead_cycles", "blend_s")
         law.learning.half_width = control.learning.half_width_cycles
         law.learning.growth = config.limits.learning_growth
-    law.feed_forward_lead_s = control.feed_forward_lead_s
+    law.feed_forward_lead_s = lead_s = _feed_forward_lead_s(config)
     if control.adaptation is not None:
         _fill_adaptation(law.adaptation, control.adaptation, joint.reduction_ratio)
+        if control.observer_paired or control.kind == "flexible_joint":
+            cycles = round(lead_s * config.loop.rate_Hz) or control.observer_delay_cycles + 1
+            law.adaptation.late_cycles = min(cycles, FED_HISTORY - 1)
     if config.friction is not None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
         law.temperature.gain = -math.expm1(-period_s(config) / WARMING_S)
@@ -195,6 +199,17 @@ def _fill_law(law: LawConstants, config: Config) -> None:
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
+
+
+def _feed_forward_lead_s(config: Config) -> float:
+    """From a command to its torque, held for a period, where it is not given."""
+    lead_s = config.control.feed_forward_lead_s
+    if lead_s != "auto":
+        return lead_s
+    delay_s = config.margin.loop_delay_s
+    if delay_s is None:
+        delay_s = config.drive.assumed_delay(config)[0]
+    return delay_s + 0.5 * period_s(config) + config.margin.current_lag_s
 
 
 def _fill_adaptation(record: AdaptationConstants, adaptation: Adaptation, ratio: float) -> None:

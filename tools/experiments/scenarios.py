@@ -26,9 +26,9 @@ from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 # --- Motions that never repeat: no law can learn them from one repetition to the next ---
 #
-#     multi_sine      six sines of 0.05 to 0.7 Hz with random phases, scaled to the joint's range and speed
+#     multi_sine      six sines of 0.1 to 1.4 Hz with random phases, scaled to the joint's range and speed
 #     point_to_point  quintics between random places, 0.4 to 1 s of rest after each
-#     reversals       a spline through random turning points, 0.3 to 2 s apart, that never rests
+#     reversals       a spline through random turning points, 0.08 to 0.4 s apart, that never rests
 #     creep           0.001 rad/s, back and forth, turning every 5 to 15 s
 #
 # Each is drawn from a seed and the number of the plant, begins and ends at rest, and is a table of `reference_at`:
@@ -38,10 +38,13 @@ from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 RandomMotion = Literal["multi_sine", "point_to_point", "reversals", "creep"]
 RANDOM_MOTIONS: tuple[RandomMotion, ...] = get_args(RandomMotion)
 REACH_rad = 0.35  # that of the sine, which the limits of the shipped configurations leave room for
-SPEED_radps = 0.4
-ACCELERATION_radps2 = 1.5
+SPEED_radps = 0.8
+ACCELERATION_radps2 = 4.0
+FREQUENCIES_Hz = (0.1, 1.4)  # of the multi-sine, log-uniform
+TURNS_s = (0.08, 0.4)  # between two reversals
 CREEP_radps = 0.001
 _ROW_S = 0.005  # of motions that are sampled: the spline between is 1e-9 rad off
+_ROWS_OF_MOVES = 5  # of each of these, where a quintic begins or ends: a spline rings there, below 1e-6 rad/s
 _NO_RESTS = np.zeros((0, 2))
 _EASE_S = 2.0  # in which a motion that does not begin at rest is faded in
 
@@ -71,7 +74,7 @@ def _multi_sine(random: np.random.Generator, duration_s: float) -> tuple[np.ndar
     time_s = np.linspace(0.0, duration_s, round(duration_s / _ROW_S) + 1)
     position = np.zeros_like(time_s)
     for _ in range(6):
-        frequency_Hz = math.exp(random.uniform(math.log(0.05), math.log(0.7)))
+        frequency_Hz = math.exp(random.uniform(*np.log(FREQUENCIES_Hz)))
         amplitude = random.uniform(0.3, 1.0) / frequency_Hz
         position += amplitude * np.sin(math.tau * (frequency_Hz * time_s + random.uniform()))
     position *= eased(time_s / _EASE_S) * eased((duration_s - time_s) / _EASE_S)
@@ -82,7 +85,7 @@ def _reversals(random: np.random.Generator, duration_s: float) -> tuple[np.ndarr
     times, places = [0.0], [0.0]
     side = 1.0
     while times[-1] < duration_s:
-        times.append(times[-1] + random.uniform(0.3, 2.0))
+        times.append(times[-1] + random.uniform(*TURNS_s))
         places.append(side * random.uniform(0.02, 0.3) * (times[-1] - times[-2]))
         side = -side
     return _within_limits(spline_table(np.array(times), np.array(places))), _NO_RESTS
@@ -90,7 +93,7 @@ def _reversals(random: np.random.Generator, duration_s: float) -> tuple[np.ndarr
 
 def _sampled(moves: list[tuple[float, float, float]], duration_s: float) -> np.ndarray:
     """A table of quintics (begin [s], end [s], distance [rad]), one after the other, from zero."""
-    time_s = np.linspace(0.0, duration_s, round(duration_s / _ROW_S) + 1)
+    time_s = np.linspace(0.0, duration_s, _ROWS_OF_MOVES * round(duration_s / _ROW_S) + 1)
     position = np.zeros_like(time_s)
     for begin_s, end_s, distance_rad in moves:
         position += distance_rad * eased((time_s - begin_s) / (end_s - begin_s))

@@ -314,7 +314,7 @@ class Tune:
         try:
             ended = command.run()
         finally:
-            self.carrier.drive_state = command.drive_state
+            self.carrier.drive_state = command.drive_state or self.carrier.drive_state
         if ended:
             raise NotCarriedOut(command.drive_state, "" if control is None else control.signals.stopped_by)
         found = self.found_friction = self.identified()

@@ -129,6 +129,22 @@ def test_ampere_conventions_and_encoder_sides(tmp_path: Path) -> None:
     assert joint_rad_per_count(config) == pytest.approx(-math.tau / 2**19 / 121.0)
 
 
+@pytest.mark.parametrize(
+    ("measured", "late", "from_command_s"),
+    [("", 2, 0.0015), ("loop_delay_s = 0.0026\n", 4, 0.0031)],  # without it one period, and half of one that it is held
+)
+def test_the_automatic_lead_is_delay_half_a_period_and_lag(
+    tmp_path: Path, measured: str, late: int, from_command_s: float
+) -> None:
+    text = VIRTUAL.replace("[margin]\n", f"[margin]\ncurrent_lag_s = 0.0007\n{measured}")
+    lead = 'feed_forward = "lugre_desired"\nfeed_forward_lead_s = "auto"\nobserver_paired = true'
+    text = text.replace("[friction]", "[control.adaptation]\n\n[friction]", 1)
+    text = re.sub('kind = "computed_torque_rbf"', 'kind = "computed_torque_observer"\nobserver_radps = 60.0', text)
+    law = constants_of(load(tmp_path, "feed_forward = .*", lead, text=text))[0].law
+    assert law.feed_forward_lead_s == pytest.approx(from_command_s + 0.0007)
+    assert law.adaptation.late_cycles == late
+
+
 def test_the_automatic_approach_keeps_to_its_speed_and_is_no_longer_than_needed(tmp_path: Path) -> None:
     config = load(tmp_path)
     assert approach_s(config, NO_TABLE, 0.0) == 1.0

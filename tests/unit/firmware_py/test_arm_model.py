@@ -14,6 +14,8 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
 from tests.arms import arm_of, pinocchio_of, random_links, set_motion
 
+JERK_radps3 = -40.0
+
 
 @pytest.mark.parametrize("joints", range(2, 8))
 def test_torques_are_those_of_pinocchio_on_random_trees(joints: int) -> None:
@@ -32,7 +34,9 @@ def test_torques_are_those_of_pinocchio_on_random_trees(joints: int) -> None:
     assert kinds == {JointKind.REVOLUTE, JointKind.PRISMATIC}
 
 
-def fed(kind: ArmFeedForward, phase: AxisPhase) -> tuple[Any, Any, np.ndarray, np.ndarray, np.ndarray]:
+def fed(
+    kind: ArmFeedForward, phase: AxisPhase, lead_s: float = 0.0
+) -> tuple[Any, Any, np.ndarray, np.ndarray, np.ndarray]:
     """(pinocchio's model, torques for the laws, positions, velocities, accelerations) of an arm on its reference."""
     rng = np.random.default_rng(1)
     links = random_links(rng, 3, prismatic=0.0)
@@ -45,6 +49,7 @@ def fed(kind: ArmFeedForward, phase: AxisPhase) -> tuple[Any, Any, np.ndarray, n
         states[i].phase = phase
         reference = states[i].reference
         reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = q[i], v[i], a[i]
+        reference.jerk_radps3, constants[i].law.feed_forward_lead_s = JERK_radps3, lead_s
         states[i].measured_position_rad = q[i] + 0.1
     feed_arm(arm, constants, states)
     return pinocchio_of(links), states.law.arm_torque_Nm, q, v, a
@@ -57,6 +62,17 @@ def at(model: Any, q: np.ndarray) -> Any:
 def test_a_law_gets_what_is_beyond_its_own_inertia() -> None:
     model, found, q, v, a = fed(ArmFeedForward.WHOLE, AxisPhase.TRACKING)
     expected = pin.rnea(model, model.createData(), at(model, q), v, a) - np.array([1.0, 2.0, 3.0]) * a
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_with_a_lead_it_is_the_model_of_the_motion_that_will_be() -> None:
+    lead_s = 0.003
+    model, found, q, v, a = fed(ArmFeedForward.WHOLE, AxisPhase.TRACKING, lead_s)
+    later = a + lead_s * JERK_radps3
+    ahead = q + lead_s * v + 0.5 * lead_s**2 * a, v + lead_s * a
+    expected = (
+        pin.rnea(model, model.createData(), at(model, ahead[0]), ahead[1], later) - np.array([1.0, 2.0, 3.0]) * later
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 

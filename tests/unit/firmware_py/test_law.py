@@ -12,6 +12,7 @@ import pytest
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
+    PAIRED_FROM_radps,
     adapt_network,
     add_to_disturbance,
     eigenvalues,
@@ -411,6 +412,19 @@ def test_closed_loop_on_the_exact_model(law: Any, kind: int) -> None:
 
 
 # --- The observer that compares what was fed forward with the torque of its own command ---
+def found_while_turning(law: Any, speed_radps: float, acceleration_radps2: float = 0.0) -> np.ndarray:
+    """What the observer finds while the desired speed turns round every 100 cycles, and nothing else moves [Nm]."""
+    state, velocity, reference = blocks(law)
+    state.observer.speed_radps = speed_radps
+    sent_Nm, found_Nm = 0.0, []
+    for k in range(400):
+        reference.velocity_radps = speed_radps if k // 100 % 2 else -speed_radps
+        reference.acceleration_radps2 = acceleration_radps2
+        sent_Nm = step_law(law, state, 0.0, velocity, reference, sent_Nm, NO_REPETITION)
+        found_Nm.append(float(state.observer_torque_Nm))
+    return np.array(found_Nm)
+
+
 @pytest.mark.parametrize("paired", [1, 0])
 @pytest.mark.parametrize("delay_cycles", [0, 1, 4])
 def test_friction_fed_forward_ahead_is_a_disturbance_only_to_the_observer_that_is_not_paired(
@@ -421,16 +435,40 @@ def test_friction_fed_forward_ahead_is_a_disturbance_only_to_the_observer_that_i
         ControllerKind.COMPUTED_TORQUE_OBSERVER, FeedForward.DESIRED, 1,
     )  # fmt: skip
     law.observer.bandwidth_radps, law.observer.delay_cycles, law.observer.paired = 60.0, delay_cycles, paired
-    state, velocity, reference = blocks(law)
-    sent_Nm, found_Nm = 0.0, []
-    for k in range(400):
-        reference.velocity_radps = 0.2 if k // 100 % 2 else -0.2
-        sent_Nm = step_law(law, state, 0.0, velocity, reference, sent_Nm, NO_REPETITION)
-        found_Nm.append(abs(state.observer_torque_Nm))
+    found_Nm = np.abs(found_while_turning(law, 0.2))
     if paired:
         assert max(found_Nm) < 1e-12
     else:  # some 17 Nm that turn round, for as many cycles as a command takes, at 60 rad/s
         assert max(found_Nm) > 0.06 * 17.0 * (delay_cycles + 1)
+
+
+@pytest.mark.parametrize(("speed_radps", "alike"), [(0.8 * PAIRED_FROM_radps, True), (1.2 * PAIRED_FROM_radps, False)])
+def test_where_the_joint_hardly_moves_both_observers_are_the_same(law: Any, speed_radps: float, alike: bool) -> None:
+    law.kind, law.feed_forward, law.filtered_error_rate = (
+        ControllerKind.COMPUTED_TORQUE_OBSERVER, FeedForward.DESIRED, 1,
+    )  # fmt: skip
+    law.observer.bandwidth_radps, law.observer.delay_cycles = 60.0, 3
+    plain = found_while_turning(law, speed_radps)
+    law.observer.paired = 1
+    paired = found_while_turning(law, speed_radps)
+    assert np.max(np.abs(plain)) > 1.0
+    assert np.allclose(paired, plain, atol=1e-9) == alike
+
+
+def test_inertia_that_is_fed_forward_is_no_disturbance_to_the_paired_observer(law: Any) -> None:
+    """The momentum is that of the error, so that the torque of the whole motion is off both sides."""
+    law.kind, law.feed_forward, law.filtered_error_rate = ControllerKind.COMPUTED_TORQUE_OBSERVER, FeedForward.NONE, 1
+    law.observer.bandwidth_radps, law.observer.delay_cycles, law.observer.paired = 60.0, 3, 1
+    assert np.max(np.abs(found_while_turning(law, 0.2, 5.0))) < 1e-12
+
+
+@pytest.mark.parametrize("lead_s", [0.0, 0.003])
+def test_inertia_is_fed_forward_for_the_acceleration_that_will_be(law: Any, lead_s: float) -> None:
+    law.kind, law.feed_forward_lead_s = ControllerKind.COMPUTED_TORQUE, lead_s
+    state, velocity, reference = blocks(law)
+    reference.acceleration_radps2, reference.jerk_radps3 = 0.4, -30.0
+    step(law, state, 0.5, velocity, reference)
+    assert state.inertia_torque_Nm == pytest.approx(law.inertia_kgm2 * (0.4 - 30.0 * lead_s))
 
 
 @pytest.mark.parametrize("paired", [1, 0])

@@ -206,16 +206,18 @@ def test_no_distance_is_rest_and_not_a_division_by_zero(kind):
         (TrajectoryKind.MIN_JERK, {"start_rad": -0.2, "target_rad": 0.5, "move_s": 1.3}),
     ],
 )
-def test_the_fourth_derivative_is_that_of_the_acceleration_twice(kind, values):
+def test_jerk_and_fourth_derivative_are_those_of_the_acceleration(kind, values):
     c, reference, step_s = constants(kind, **values), new(Reference)[0], 1e-4
     for t_s in (0.2, 0.65, 1.1):
         around = [at(c, t_s + k * step_s)[2] for k in (-1, 0, 1)]
         reference_at(c, NO_TABLE, 0, t_s, reference)
         expected = (around[0] - 2.0 * around[1] + around[2]) / step_s**2
         assert reference.snap_radps4 == pytest.approx(expected, rel=1e-3, abs=1e-3)
+        slope = (around[2] - around[0]) / (2.0 * step_s)
+        assert reference.jerk_radps3 == pytest.approx(slope, rel=1e-5, abs=1e-5)
 
 
-def test_the_fourth_derivative_of_an_approach_and_of_rest():
+def test_jerk_and_fourth_derivative_of_an_approach_and_of_rest():
     reference, coefficients, step_s = new(Reference)[0], np.zeros(6), 1e-4
     reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 0.6, 0.2, -1.0
     plan_approach(0.1, reference, 2.0, coefficients)
@@ -225,11 +227,12 @@ def test_the_fourth_derivative_of_an_approach_and_of_rest():
         around.append(float(reference.acceleration_radps2))
     approach_at(coefficients, 0.7, reference)
     assert reference.snap_radps4 == pytest.approx((around[0] - 2.0 * around[1] + around[2]) / step_s**2, rel=1e-3)
+    assert reference.jerk_radps3 == pytest.approx((around[2] - around[0]) / (2.0 * step_s), rel=1e-5)
     brake_step(reference, 1.0, 1e-3)
-    assert reference.snap_radps4 == 0.0
+    assert reference.snap_radps4 == reference.jerk_radps3 == 0.0
     approach_at(coefficients, 0.7, reference)
     reference_at(constants(TrajectoryKind.HOLD, start_rad=0.3), NO_TABLE, 0, 1.0, reference)
-    assert reference.snap_radps4 == 0.0
+    assert reference.snap_radps4 == reference.jerk_radps3 == 0.0
 
 
 @quick
@@ -278,7 +281,7 @@ def test_brake_lands_on_exactly_zero_within_the_deceleration(position, velocity,
     assert abs(float(reference.position_rad) - ideal) <= brake * period_s**2
     resting = float(reference.position_rad)
     brake_step(reference, brake, period_s)
-    assert reference.tolist() == (resting, 0.0, 0.0, 0.0)
+    assert reference.tolist() == (resting, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_a_brake_that_is_not_positive_stops_at_once():
@@ -286,7 +289,7 @@ def test_a_brake_that_is_not_positive_stops_at_once():
         reference = new(Reference)[0]
         reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 1.0, 2.0, 3.0
         brake_step(reference, brake, 1e-3)
-        assert reference.tolist() == (1.0, 0.0, 0.0, 0.0)
+        assert reference.tolist() == (1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # --- Tables from CSV, the demands of a trajectory, the duration of an approach; compiled and plain runs agree ---
@@ -504,7 +507,8 @@ for kind in range(4):
             step_plant(pc[0], ps[0], 40.0 if k < 200 else -55.0)
         s = ps[0]
         out.append([encoder_counts(pc[0], s), float(s.joint_position_rad), float(s.joint_velocity_radps),
-                    float(s.friction_torque_Nm), float(s.motor_position_rad)])
+                    float(s.friction_torque_Nm), float(s.motor_position_rad),
+                    float(s.actuator_torque_Nm)])
 print(json.dumps(out))
 """
 
@@ -514,5 +518,5 @@ def test_compiled_and_plain_python_agree():
         np.array(json.loads(run_python(_BOTH_WAYS, NUMBA_DISABLE_JIT=disabled, PYTHONWARNINGS="error")))
         for disabled in ("0", "1")
     )
-    assert compiled.shape == (238, 5)
+    assert compiled.shape == (238, 6)
     assert plain == pytest.approx(compiled, rel=1e-9, abs=1e-12)

@@ -12,7 +12,7 @@ from jointctl.firmware_py.arm_model import ArmFeedForward
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.plant_settings import arm_plant_of
