@@ -148,6 +148,14 @@ class Kernel:
             entry = self._entry(tuple(form), arguments)
         return entry(numbers)
 
+    def bound(self, *arguments: Any) -> Callable[[], Any]:
+        """A call with these arguments, taken over once."""
+        numbers: list[Any] = []
+        form: list[Any] = []
+        for each in arguments:
+            machine_code.flatten(each, numbers, form)
+        return self._entry(tuple(form), arguments).bound(numbers)
+
     def _entry(self, form: tuple[Any, ...], arguments: tuple[Any, ...]) -> machine_code.Entry:
         with _lock:
             if form not in self._entries:
@@ -213,6 +221,14 @@ def kernel(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile a function whose machine code is copied into its callers: what it returns stays in registers."""
     return function if JIT_DISABLED else cast(Function, Kernel(function, forceinline=True))
+
+
+def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """A call of a kernel with these arguments, all of them, for many times: they are taken over from Python once.
+
+    The caller keeps the arrays, whose contents may change between two calls.
+    """
+    return function.bound(*arguments) if isinstance(function, Kernel) else functools.partial(function, *arguments)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import enum
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -203,9 +204,16 @@ class Entry:
         self._call = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(address)  # without the interpreter's lock
 
     def __call__(self, numbers: Sequence[Any]) -> Any:
+        return self.bound(numbers)()
+
+    def bound(self, numbers: Sequence[Any]) -> Callable[[], Any]:
+        """A call with these numbers: what they are the addresses of must outlive it."""
         slots = self._slots()
         self._pack(slots, self._offset, *numbers)
-        if self._call(ctypes.addressof(slots)) != 0:
+        return functools.partial(self._carry_out, slots, ctypes.addressof(slots))
+
+    def _carry_out(self, slots: Any, address: int) -> Any:
+        if self._call(address) != 0:
             raise RuntimeError(f"{self._name} ended with an exception")
         if not self._size:
             return self._result.made([])
@@ -312,5 +320,9 @@ def unresolved(object_code: bytes) -> list[str] | None:
 
 def stands_alone(object_code: bytes) -> bool:
     """Whether this process has all that it calls, without the compiler."""
-    names, process = unresolved(object_code), ctypes.CDLL(None)
+    names = unresolved(object_code)
+    try:
+        process = ctypes.CDLL(None)
+    except TypeError:  # Windows
+        return False
     return names is not None and all(name == _LINKERS_OWN or hasattr(process, name) for name in names)

@@ -13,7 +13,7 @@ heartbeat then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -346,20 +346,17 @@ def run_lockstep(
 
 
 @kernel
-def parts_of_a_run(
+def part_of_a_run(
     memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, part: np.ndarray, no_truth: np.ndarray
-) -> Iterator[tuple[int, int]]:
-    """For a run that is made of many short parts: each `next` carries out one, without true values.
+) -> tuple[int, int]:
+    """One of the many short parts that a run is made of (`kernel.bound`), without true values.
 
-    `part` int64[2]: when it begins and its cycles, to be set before; `no_truth` float64[0, TRUTHS].  Arguments are
-    taken over from Python once: for a part of one cycle that would last ten times as long as the cycle.  The caller
-    keeps the arrays.
+    `part` int64[2]: when it begins and its cycles, to be set before; `no_truth` float64[0, TRUTHS].
     """
     s = scenario
-    while True:
-        now = Scenario(
-            part[0], s.period_ns, part[1], s.stop_cycle, s.stop_request, s.tail_cycles, s.log_every, s.ideal_velocity,
-            s.supervisor_beats, s.lost_to_drive, s.lost_from_drive, s.set_points,
-            s.thermometer,
-        )  # fmt: skip
-        yield _run(memory, codec, world, now, no_truth)
+    now = Scenario(
+        part[0], s.period_ns, part[1], s.stop_cycle, s.stop_request, s.tail_cycles, s.log_every, s.ideal_velocity,
+        s.supervisor_beats, s.lost_to_drive, s.lost_from_drive, s.set_points,
+        s.thermometer,
+    )  # fmt: skip
+    return _run(memory, codec, world, now, no_truth)

@@ -21,6 +21,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import Arm, no_arm
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
+from jointctl.firmware_py.kernel import bound
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
@@ -35,7 +36,7 @@ from jointctl.hil.lockstep import (
     Scenario,
     TRUE_POSITION_rad,
     World,
-    parts_of_a_run,
+    part_of_a_run,
     run_lockstep,
 )
 from jointctl.hil.virtual_bus import FRAME_SIZE
@@ -153,7 +154,7 @@ class SteppedRun:
         self._part = np.zeros(2, np.int64)
         self._truth = np.zeros((0, TRUTHS))  # none
         self._scenario = Scenario(start_ns, self._period_ns, 0, thermometer=thermometer)
-        self._parts = parts_of_a_run(memory, codec, world, self._scenario, self._part, self._truth)
+        self._carry_out = bound(part_of_a_run, memory, codec, world, self._scenario, self._part, self._truth)
 
     def step(self, cycles: int) -> None:
         """So many cycles, fewer if all axes have FINISHED; the simulated time goes on all the same."""
@@ -164,7 +165,7 @@ class SteppedRun:
                 self._keep()
             if self._moving():
                 self._part[:] = self.now_ns, count
-                next(self._parts)
+                self._carry_out()
             self.now_ns += count * self._period_ns
             cycles -= count
 

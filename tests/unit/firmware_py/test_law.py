@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jointctl.firmware_py.disturbance_observer import (
+    PAIRED_FROM_radps,
+    add_to_disturbance,
+    reset_observer,
+    step_observer,
+)
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
-    PAIRED_FROM_radps,
     adapt_network,
-    add_to_disturbance,
     eigenvalues,
     follow_temperature,
     friction_feed_forward_Nm,
@@ -24,10 +28,8 @@ from jointctl.firmware_py.law import (
     reset_law,
     reset_learning,
     reset_network,
-    reset_observer,
     solve_lyapunov_p,
     step_law,
-    step_observer,
     ultimate_bounds,
     watch_learning,
 )

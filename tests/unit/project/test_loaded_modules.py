@@ -57,7 +57,7 @@ def test_a_loop_that_was_compiled_once_is_loaded_without_the_compiler() -> None:
     command = [sys.executable, "-P", "-c", COMPILED]
     for _ in range(2):
         found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    assert "jointctl.firmware_py.realtime" in found
+    assert "jointctl.firmware_py.cycle" in found
     assert [
         name for name in ("numba", "scipy", "pydantic", "can", "jointctl.firmware_py.compiler") if name in found
     ] == []
