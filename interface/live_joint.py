@@ -256,7 +256,7 @@ class LiveMotor:
         self._end()
 
     def _end(self) -> None:
-        """Ask for the end, and wait for it; Ctrl-C meanwhile asks for more, as in `jointctl run`."""
+        """Ask for the end, and wait for it; Ctrl-C in between asks for more, as in `jointctl run`."""
         control, thread = self._control, self._thread
         if control is None or thread is None:
             return

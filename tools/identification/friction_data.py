@@ -231,7 +231,7 @@ def check_given(given: ForeignFormat) -> None:
             raise UsageError(f"--counts-per-turn is missing: a unit (={unit}) needs it")
 
 
-def require_told(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
+def require_stated(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
     """`UsageError` where what a table does not tell was not given: the torque's column, and each (flag, value)."""
     if not (given.torque_column or given.current_column):
         raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
@@ -295,8 +295,8 @@ def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
     """Points in our units; `UsageError` where something that a table does not tell was not given."""
     if not given.velocity_column:
         raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
-    told = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
-    require_told(table, given, told)
+    stated = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
+    require_stated(table, given, stated)
     assert given.ratio is not None
     table = chosen_lines(table, given)
     velocity, torque = velocity_radps(table, given), motor_torque_Nm(table, given)

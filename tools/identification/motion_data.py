@@ -43,7 +43,7 @@ _SAME = 1e-9
 _SAME_RATE = 0.01
 _TOP_SPEED_radps, _DIRECT = 100.0, 2.0  # of a joint behind a reducer; with a ratio below it is that of a motor
 _DIRECT_SPEED_radps = 1000.0
-_MOST_rad = 4.0 * math.pi  # of a joint: farther is told
+_MOST_rad = 4.0 * math.pi  # of a joint: farther gets a note
 _LEVELS = 4.0  # times as often as the value before it a limit is reached; the end of a coarse range is not
 _SIDE_TOLERANCE = 0.5  # of the logarithm of a factor that is near the ratio
 

@@ -23,7 +23,7 @@ from jointctl.tools.identification.friction_data import (
     check_given,
     chosen_lines,
     motor_torque_Nm,
-    require_told,
+    require_stated,
     velocity_radps,
 )
 from jointctl.tools.identification.motion_data import (
@@ -156,4 +156,4 @@ def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
     needed: list[tuple[str, object]] = [("--side", side), ("--ratio", given.ratio)]
     needed += [("--position-unit", given.position_unit)] if given.position_column else []
     needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
-    require_told(table, given, needed)
+    require_stated(table, given, needed)

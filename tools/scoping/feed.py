@@ -130,12 +130,12 @@ class ScopeFeed:
         """So are phases."""
 
     def show(self, snapshot: Snapshot) -> None:
-        told: dict[str, Any] = {"temperature_degC": snapshot.temperature_degC}
+        shown: dict[str, Any] = {"temperature_degC": snapshot.temperature_degC}
         if self._states:
-            told["skipped"] = snapshot.skipped  # a server of all records counts them
-        if snapshot.axis == 0 and told != self._told:
-            self._told = told
-            self.settings(told)
+            shown["skipped"] = snapshot.skipped  # a server of all records counts them
+        if snapshot.axis == 0 and shown != self._told:
+            self._told = shown
+            self.settings(shown)
         if self._states:
             self._hold(snapshot)
         else:
