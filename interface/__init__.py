@@ -30,20 +30,17 @@ if TYPE_CHECKING:
         UsageError,
     )
     from jointctl.joint import Joint, SetPointError, State
-    from jointctl.verbs import (
+    from jointctl.signatures import (
         check,
         clear_fault,
         demo,
         doctor,
         excite,
         fault_campaign,
-        identify,
-        identify_motion,
         info,
         map,
         new,
         paper,
-        read_log,
         report,
         response,
         run,
@@ -55,6 +52,7 @@ if TYPE_CHECKING:
         validate,
         zero,
     )
+    from jointctl.verbs import identify, identify_motion, read_log
 
     __version__: str
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
+import runpy
 import subprocess
 import sys
 from importlib import import_module
@@ -27,6 +29,13 @@ def test_every_name_is_there_and_typed() -> None:
     assert Path(jointctl.__file__).with_name("py.typed").exists()
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = jointctl.nothing  # type: ignore[attr-defined]
+
+
+def test_what_a_type_checker_knows_of_the_options_is_what_they_are() -> None:
+    """Written anew by `python docs/signatures.py`."""
+    made = runpy.run_path(str(CONFIGS.parent / "docs" / "signatures.py"))
+    written = made["TARGET"].read_text(encoding="utf-8")
+    assert ast.dump(ast.parse(made["stub"]())) == ast.dump(ast.parse(written))
 
 
 def test_importing_loads_nothing_heavy() -> None:
