@@ -45,6 +45,7 @@ from jointctl.tools.session.session_drive import Guard, session_drive
 from jointctl.tools.session.set_points import SetPointSources
 
 POLL_S = 0.02
+NOTED_WITHIN_NS = 250_000_000  # from the request of `jointctl stop` until the program has taken note of it, at most
 SYNC_SPREAD_us = 100.0  # of the buses of an arm: what is longer is a warning
 Answer = TypeVar("Answer")
 
@@ -62,9 +63,12 @@ def spread_text(spread: TimeSummary | None) -> tuple[int, str, str] | None:
 
 
 def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
-    """Whether the loop had latched its fault by then."""
+    """Whether the loop had latched its fault by then, and not by what `jointctl stop` did to the drive.
+
+    Its request is sent first, but a program that is busy may take note of it after the drive has been stopped.
+    """
     faulty = records[records.fault != Fault.NONE]
-    return fault is not Fault.NONE and len(faulty) > 0 and int(faulty[0].time_ns) <= time_ns
+    return fault is not Fault.NONE and len(faulty) > 0 and int(faulty[0].time_ns) <= time_ns - NOTED_WITHIN_NS
 
 
 class Session:

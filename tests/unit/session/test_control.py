@@ -12,11 +12,14 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from jointctl.drivers.bus_lock import BusLock, lock_name, wait_for_answers
 from jointctl.drivers.errors import BusError
-from jointctl.firmware_py.states import StopRequest
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.output import Output
 from jointctl.tools.session import control, stop_call
 from jointctl.tools.session.control import (
@@ -31,6 +34,7 @@ from jointctl.tools.session.control import (
     stop_signals,
     stop_within_s,
 )
+from jointctl.tools.session.session import NOTED_WITHIN_NS, came_before
 from jointctl.tools.session.stop_call import StopCall
 
 
@@ -391,3 +395,15 @@ def test_those_that_live_on_after_a_signal_are_told(monkeypatch: pytest.MonkeyPa
     with subprocess.Popen(["sleep", "60"]) as process:
         assert stop_call._signalled([process.pid], "its name", signal.SIGCONT, 0.01) == [process.pid]
         process.kill()
+
+
+@pytest.mark.parametrize(
+    ("early_ns", "came_first"), [(0, False), (NOTED_WITHIN_NS - 1, False), (NOTED_WITHIN_NS, True)]
+)
+def test_a_fault_just_before_the_stop_was_noted_is_the_stops_own_work(early_ns: int, came_first: bool) -> None:
+    """`stop` sends its request, then stops the drive: a busy program sees the drive first."""
+    records = np.zeros(3, dtype_of(LogRecord)).view(np.recarray)
+    records.time_ns = 10_000_000_000 + np.arange(3) * 1_000_000
+    records.fault[1:] = Fault.DRIVE_NOT_ENABLED
+    assert came_before(Fault.DRIVE_NOT_ENABLED, records, 10_001_000_000 + early_ns) is came_first
+    assert not came_before(Fault.NONE, records, 20_000_000_000)
