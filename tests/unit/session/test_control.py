@@ -407,3 +407,11 @@ def test_a_fault_just_before_the_stop_was_noted_is_the_stops_own_work(early_ns: 
     records.fault[1:] = Fault.DRIVE_NOT_ENABLED
     assert came_before(Fault.DRIVE_NOT_ENABLED, records, 10_001_000_000 + early_ns) is came_first
     assert not came_before(Fault.NONE, records, 20_000_000_000)
+
+
+@pytest.mark.parametrize(("early_ns", "came_first"), [(-1, False), (0, True), (NOTED_WITHIN_NS - 1, True)])
+def test_a_fault_of_the_joint_before_the_stop_is_not_laid_to_it(early_ns: int, came_first: bool) -> None:
+    records = np.zeros(3, dtype_of(LogRecord)).view(np.recarray)
+    records.time_ns = 10_000_000_000 + np.arange(3) * 1_000_000
+    records.fault[1:] = Fault.POSITION_LIMIT
+    assert came_before(Fault.POSITION_LIMIT, records, 10_001_000_000 + early_ns) is came_first
