@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,11 +15,12 @@ from pathlib import Path
 
 import can
 import pytest
+import tomlkit
 
 from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.errors import BusError
 from jointctl.tools.recording.run_log_reader import read_run_log
-from tests.configurations import written
+from tests.configurations import set_keys, written
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
@@ -123,6 +125,110 @@ def test_candump_sees_the_run_and_cansend_can_stop_it(tmp_path: Path, config: st
         lines = dump.communicate()[0].splitlines()
     identifiers = {line.split()[2].split("#")[0] for line in lines}
     assert {"080", "181", "201", "77E", "601", "581"} <= identifiers
+
+
+# --- a stop, and other controllers ---
+def drive_state(folder: Path, node: int = 1, channel: str = "vcan0") -> str:
+    info = run(folder, "info", "-i", "socketcan", "-c", channel, "-t", str(node), "--json")
+    return str(json.loads(info.stdout)["state"]["drive_state"])
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_stop_in_the_motion_ends_the_run(tmp_path: Path, config: str) -> None:
+    with tracking(tmp_path, config) as started:
+        stopped = run(tmp_path, "stop", config, *ON_VCAN)
+        assert stopped.returncode == 0, stopped.stderr
+        assert started.stderr is not None
+        rest = started.stderr.read()
+        assert started.wait(60.0) == 130, rest
+    assert "jointctl stop" in rest
+    assert drive_state(tmp_path) == "switch on disabled"
+
+
+@pytest.mark.parametrize("after_s", [1.0, 3.0, 5.0, 7.0])  # the guest's start takes some seconds
+@pytest.mark.usefixtures("joint")
+def test_a_stop_before_the_motion_is_final(tmp_path: Path, config: str, after_s: float) -> None:
+    """The program was starting, listening, or commissioning the drive: it ends, and no frame enables afterwards."""
+    with subprocess.Popen(["candump", "-L", "vcan0,201:7FF"], stdout=subprocess.PIPE, text=True) as dump:
+        with subprocess.Popen(
+            jointctl("run", config, *ON_VCAN, *SLOW_GUEST), cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        ) as started:
+            time.sleep(after_s)
+            stopped = run(tmp_path, "stop", config, *ON_VCAN)
+            ended_s = time.time()
+            assert stopped.returncode == 0, stopped.stderr
+            said = started.communicate(timeout=60.0)[1]
+            assert started.returncode == 130, said
+        time.sleep(1.0)
+        dump.terminate()
+        lines = dump.communicate()[0].splitlines()
+    commands = [(float(line.split()[0].strip("()")), line.split("#")[1][:4]) for line in lines]
+    assert not [command for time_s, command in commands if time_s > ended_s and command == "0F00"]
+    assert drive_state(tmp_path) == "switch on disabled"
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_joint_that_another_master_commands_is_left_alone(tmp_path: Path, config: str) -> None:
+    """SYNC every 20 ms: nothing is sent, which candump sees."""
+    sync = ["cangen", "vcan0", "-g", "20", "-I", "080", "-L", "0"]
+    with subprocess.Popen(sync) as foreign, subprocess.Popen(
+        ["candump", "-L", "vcan0,080~7FF"], stdout=subprocess.PIPE, text=True
+    ) as dump:  # fmt: skip
+        try:
+            refused = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
+        finally:
+            foreign.terminate()
+        dump.terminate()
+        others = {line.split()[2].split("#")[0] for line in dump.communicate()[0].splitlines()}
+    assert refused.returncode == 4, refused.stderr
+    assert "SYNC" in refused.stderr
+    assert others <= {"701"}  # the drive's own heartbeat
+
+
+@pytest.mark.usefixtures("interface")
+def test_an_arm_on_two_interfaces_moves_and_stops_as_one(tmp_path: Path) -> None:
+    """Shoulder and elbow on vcan0, the wrist with the shoulder's node on vcan1."""
+    folder = tmp_path / "arm"
+    shutil.copytree(CONFIG.parent / "arm", folder)
+    urdf = folder / "arm.urdf"
+    urdf.write_text(re.sub(r'velocity="[\d.]+"', 'velocity="20"', urdf.read_text()))
+    for path in folder.glob("*.toml"):
+        document = tomlkit.parse(path.read_text())
+        if "arm" in document:
+            set_keys(document, motion__duration_s=30.0)
+        else:
+            own = GENTLE | {
+                "loop.rate_Hz": 250.0, "control.velocity_cutoff_Hz": 60.0, "limits.velocity_max_radps": 20.0,
+                "bus.interface": "socketcan", "bus.channel": "vcan0",
+            }  # fmt: skip
+            if path.stem == "wrist":
+                own |= {"bus.channel": "vcan1", "drive.node": 1}
+            set_keys(document, **{key.replace(".", "__"): value for key, value in own.items()})
+        path.write_text(tomlkit.dumps(document))
+    with subprocess.Popen(jointctl("hil", "arm/arm.toml"), cwd=tmp_path, stderr=subprocess.PIPE, text=True) as drives:
+        try:
+            assert drives.stderr is not None
+            while "Ctrl-C ends it" not in (line := drives.stderr.readline()):
+                assert line, f"ended with {drives.wait()}"
+            with subprocess.Popen(
+                jointctl("run", "arm/arm.toml", *SLOW_GUEST), cwd=tmp_path, stderr=subprocess.PIPE, text=True
+            ) as started:
+                assert started.stderr is not None
+                seen = [""]
+                while "tracking" not in seen[-1]:
+                    seen.append(started.stderr.readline())
+                    assert seen[-1], f"ended with {started.wait()}: {''.join(seen)}"
+                stopped = run(tmp_path, "stop", "arm/wrist.toml")
+                assert stopped.returncode == 0, stopped.stderr
+                rest = started.stderr.read()
+                assert started.wait(60.0) == 130, rest
+            states = [
+                drive_state(tmp_path, node, channel) for node, channel in ((1, "vcan0"), (2, "vcan0"), (1, "vcan1"))
+            ]
+            assert states == ["switch on disabled"] * 3
+        finally:
+            drives.terminate()
+            drives.communicate(timeout=20.0)
 
 
 @pytest.mark.usefixtures("joint")
