@@ -188,6 +188,8 @@ def test_a_joint_that_another_master_commands_is_left_alone(tmp_path: Path, conf
 @pytest.mark.usefixtures("interface")
 def test_an_arm_on_two_interfaces_moves_and_stops_as_one(tmp_path: Path) -> None:
     """Shoulder and elbow on vcan0, the wrist with the shoulder's node on vcan1."""
+    if not Path("/sys/class/net/vcan1").exists():
+        pytest.skip("no vcan1 beside vcan0")
     folder = tmp_path / "arm"
     shutil.copytree(CONFIG.parent / "arm", folder)
     urdf = folder / "arm.urdf"
