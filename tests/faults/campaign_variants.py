@@ -38,6 +38,7 @@ def write_variant(name: str, folder: Path) -> Path:
     for pattern, changed in VARIANTS[name]:
         text, count = re.subn(pattern, changed, text, count=1, flags=re.MULTILINE)
         assert count == 1, pattern
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.toml"
     path.write_text(text)
     return path
