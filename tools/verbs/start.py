@@ -52,8 +52,19 @@ def _stop_signals() -> list[int]:
     return [number for number in numbers if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)]
 
 
+def _hurry() -> None:
+    """`jointctl stop` before all ordinary programs, where the system allows it: it has Python to load first.
+
+    The lowest of the real-time priorities, below any loop's.
+    """
+    if sys.argv[1:2] == ["stop"] and hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
 def main() -> None:
     """Until the verb begins, a stop simply ends the process; from then on it is a KeyboardInterrupt."""
+    _hurry()
     ours = _stop_signals()
     for number in ours:
         signal.signal(number, _end_at_once)
