@@ -299,4 +299,8 @@ def open_python_can(
         if isinstance(error, (can.CanError, ValueError, TypeError)):
             raise BusError(f"cannot open {place}: {error}", _remedy(interface, "")) from None
         hint = _remedy(interface, f"is the driver of {interface} installed?")
+        if isinstance(error, (NameError, AttributeError)):  # python-can goes on without it until the first call
+            lacks = "the library of the adapter's maker is not installed, or too old"
+            missing = f"{error.name} is missing" if error.name else str(error)
+            raise BusError(f"cannot open {place}: {lacks}: {missing}", hint) from None
         raise BusError(f"cannot open {place}: {type(error).__name__}: {error}", hint) from None

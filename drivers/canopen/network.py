@@ -15,7 +15,17 @@ from typing import Any
 import can
 import canopen
 
-from jointctl.drivers.canopen.identifiers import HEARTBEAT_ID, NMT_ID, RPDO_IDS, SDO_REQUEST_ID, SYNC_ID, NmtCommand
+from jointctl.drivers.canopen.identifiers import (
+    FUNCTION_MASK,
+    HEARTBEAT_ID,
+    NMT_ID,
+    NODE_MASK,
+    RPDO_IDS,
+    SDO_REQUEST_ID,
+    SYNC_ID,
+    TPDO_IDS,
+    NmtCommand,
+)
 from jointctl.drivers.errors import BusError
 
 NOTIFIER_S = 0.05  # how long the receiving thread waits before it looks whether it is to end
@@ -44,7 +54,7 @@ class BusFailure(can.Listener):
 
 
 class OtherControllers(can.Listener):
-    """Notices what only a controller sends: SYNC, NMT commands, SDO requests and RPDOs to `nodes`, our heartbeat.
+    """Notices what only a controller sends: SYNC, NMT, SDO requests, RPDOs and node guarding of `nodes`, our heartbeat.
 
     It listens from its making on, for LISTEN_S unless the bus is `private`: made a moment ago for this program alone,
     in a process that it has started itself, with simulated drives.  There it names what comes, and waits for nothing.
@@ -94,9 +104,9 @@ class OtherControllers(can.Listener):
                 self._echoes = True
                 return
             self._identifiers[identifier] += 1
-            if words := self._words(identifier, data):
+            if words := self._asked(identifier) if msg.is_remote_frame else self._words(identifier, data):
                 self._seen[words] += 1
-            elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE:
+            elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE and not msg.is_remote_frame:
                 if (node := identifier - HEARTBEAT_ID) not in self._nodes:
                     self.heartbeats.add(node)
 
@@ -108,6 +118,15 @@ class OtherControllers(can.Listener):
                 self._own.clear()
             if self._echoes is not False:
                 self._own[identifier, data] += 1
+
+    def _asked(self, identifier: int) -> str:
+        """What a remote frame asks for, if of our nodes: state (node guarding, CiA 301, 7.2.8.2.2.1) or a TPDO."""
+        base, node = identifier & FUNCTION_MASK, identifier & NODE_MASK
+        if self._beside_own_loop or node not in self._nodes:
+            return ""
+        if base == HEARTBEAT_ID:
+            return f"node guarding of node {node} ({identifier:03X}h)"
+        return f"remote request for a TPDO of node {node} ({identifier:03X}h)" if base in TPDO_IDS else ""
 
     def _words(self, identifier: int, data: bytes) -> str:
         """What a frame is, if only a controller sends it; beside our own loop, what the loop does not send either."""

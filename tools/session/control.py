@@ -206,10 +206,16 @@ def control_of(interface: str, channel: str, output: Output, within_s: float = S
 def _locked(
     places: Sequence[tuple[str, str]], output: Output, within_s: float, signals: StopSignals
 ) -> Iterator[Control]:
-    """The locks of all buses: a stop by any of them is one of the whole program."""
-    with ExitStack() as stack:
-        locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
-        no_longer_starting()
-        for remark in (remark for lock in locks for remark in lock.remarks):
-            output.warning(remark)
-        yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
+    """The locks of all buses: a stop by any of them is one of the whole program.
+
+    A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.
+    """
+    try:
+        with ExitStack() as stack:
+            locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
+            no_longer_starting()
+            for remark in (remark for lock in locks for remark in lock.remarks):
+                output.warning(remark)
+            yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(signals.by_command) from None

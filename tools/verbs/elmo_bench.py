@@ -109,12 +109,21 @@ class PortTarget:
                 output.note("the run did not say that the drive is off: telling the drive itself")
         port, shared = _opened(self, output)
         try:
-            line = Dialogue(port, self.reply_timeout_s)
-            return switch_off(port, line, SHARED_ATTEMPTS) if shared else switch_off(port, line)
+            return self._told(port, shared)
         except JointctlError as error:
             return f"unknown: it was commanded to switch off, but {error.message}"
         finally:
             port.close()
+
+    def _told(self, port: SerialPort, shared: bool) -> str:
+        """The state of the drive, from its own answers."""
+        line = Dialogue(port, self.reply_timeout_s)
+        if shared:
+            return switch_off(port, line, SHARED_ATTEMPTS)
+        try:
+            return switch_off(port, line)
+        except BusError:  # garbled: another `stop` has come to the same line
+            return switch_off(port, line, SHARED_ATTEMPTS)
 
 
 def _opened(target: PortTarget, output: Output) -> tuple[SerialPort, bool]:

@@ -154,8 +154,8 @@ def main() -> None:
         if error.filename is None:
             abandon(sys.stdout)
         sys.exit(DataError.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        Output().note("interrupted")
+    except (KeyboardInterrupt, typer.Abort) as error:
+        Output().note(f"interrupted{error}")
         sys.exit(INTERRUPTED)
     except Exception as error:
         _end_unexpected(error)

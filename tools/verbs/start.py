@@ -1,4 +1,4 @@
-"""The first code of `jointctl`: Ctrl-C during the imports of the command line ends it without a traceback."""
+"""The first code of `jointctl`: a stop during the imports of the command line ends it with a word, and no traceback."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import io
 import os
 import signal
 import sys
+from types import FrameType
 
 STARTING = "jointctl-starting"  # as in `drivers.bus_lock`, whose imports take their time
 # verbs that control a bus; the tests compare them with what each verb does
@@ -34,17 +35,45 @@ def _mark_as_starting() -> None:
 FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
 
 
+def _end_at_once(number: int, _: FrameType | None) -> None:
+    """Nothing is open yet that would have to be closed."""
+    with contextlib.suppress(OSError):
+        os.write(2, b"interrupted; nothing was begun\n")
+    os._exit(128 + signal.SIGINT)
+
+
+def _stop_signals() -> list[int]:
+    """Those that end this program as Ctrl-C does: of a verb that moves a joint, all that are not ignored.
+
+    A script's background job ignores Ctrl-C, and `nohup` a closed terminal.
+    """
+    names = ("SIGINT", "SIGTERM", "SIGHUP") if will_control(set(sys.argv[1:])) else ("SIGINT",)
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    return [number for number in numbers if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL)]
+
+
+def _hurry() -> None:
+    """`jointctl stop` before all ordinary programs, where the system allows it: it has Python to load first.
+
+    The lowest of the real-time priorities, below any loop's.
+    """
+    if sys.argv[1:2] == ["stop"] and hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
 def main() -> None:
-    """Nothing is open yet that would have to be closed: the signal may simply end the process (130 in a shell)."""
+    """Until the verb begins, a stop simply ends the process; from then on it is a KeyboardInterrupt."""
+    _hurry()
+    ours = _stop_signals()
+    for number in ours:
+        signal.signal(number, _end_at_once)
     _mark_as_starting()
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a script's background job ignores it
-    if ours:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
     _require_descriptors()
     from jointctl.tools.verbs.main import main as run
 
-    if ours:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in ours:
+        signal.signal(number, signal.default_int_handler)
     run()
 
 

@@ -13,7 +13,8 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial, wraps
 from importlib import resources
@@ -208,8 +209,27 @@ class Verb(TyperCommand):
         return without_types_of_flags(super().get_params(ctx))
 
 
+@contextmanager
+def _interruption_kept() -> Iterator[None]:
+    """Typer makes an exit code of a KeyboardInterrupt, and no word; it leaves this one to the program."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise typer.Abort(*error.args) from None
+
+
 class Verbs(TyperGroup):
-    """A flag shows no type in the help."""
+    """A flag shows no type in the help; an interruption is one for the program."""
+
+    def make_context(self, *args: Any, **keywords: Any) -> Any:
+        """What was given on the command line, which may be a configuration."""
+        with _interruption_kept():
+            return super().make_context(*args, **keywords)
+
+    def invoke(self, ctx: Any) -> Any:
+        """The verb."""
+        with _interruption_kept():
+            return super().invoke(ctx)
 
     def get_params(self, ctx: Any) -> Any:
         """Those that a page of help shows."""

@@ -252,6 +252,26 @@ def test_every_problem_of_a_configuration_has_a_line(
 CONTROLS = re.compile(r"import .*\b(in_control|control_of|carried_out|tracked)\b")
 
 
+@pytest.mark.parametrize(
+    ("words", "hurries"), [(["stop", "my_joint.toml"], True), (["run", "stop"], False), ([], False)]
+)
+@pytest.mark.parametrize("error", [None, PermissionError(1, "Operation not permitted")])
+def test_a_stop_goes_before_ordinary_programs_where_that_is_allowed(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], hurries: bool, error: OSError | None
+) -> None:
+    asked: list[tuple[int, int]] = []
+
+    def set_scheduler(pid: int, policy: int, parameters: os.sched_param) -> None:
+        asked.append((policy, parameters.sched_priority))
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr(os, "sched_setscheduler", set_scheduler)
+    monkeypatch.setattr("sys.argv", ["jointctl", *words])
+    start._hurry()
+    assert asked == ([(os.SCHED_RR, 1)] if hurries else [])
+
+
 def test_every_verb_that_controls_a_bus_is_known_before_its_imports() -> None:
     """Else a stop that comes while it is starting ends nothing, and the joint moves all the same."""
     sources = Path(run_verb.__file__).parent.glob("*.py")

@@ -17,10 +17,10 @@ import pytest
 
 from jointctl.drivers import errors
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import DECLINED
+from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.verbs import doctor, run, sweep
+from jointctl.tools.verbs import doctor, run, sweep, verb_options
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
@@ -141,14 +141,50 @@ STUCK = (
 )
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, -signal.SIGTERM)])
-def test_during_the_imports_it_ends_without_a_traceback(number: signal.Signals, code: int) -> None:
-    started = subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_during_the_imports_of_a_verb_that_moves_a_joint_a_stop_ends_it_with_one_line(number: signal.Signals) -> None:
+    started = subprocess.Popen(
+        [sys.executable, "-c", STUCK, "run", "-y"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     assert started.stdout is not None
     assert started.stdout.readline() == "importing\n"
     started.send_signal(number)
-    assert started.communicate(timeout=20.0)[1] == ""
+    assert started.communicate(timeout=20.0)[1] == "interrupted; nothing was begun\n"
+    assert started.returncode == INTERRUPTED
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, -signal.SIGTERM)])
+def test_its_twin_another_verb_is_ended_by_a_signal_as_any_program(number: signal.Signals, code: int) -> None:
+    started = subprocess.Popen([sys.executable, "-c", STUCK, "check"], stdout=subprocess.PIPE, text=True)
+    assert started.stdout is not None
+    assert started.stdout.readline() == "importing\n"
+    started.send_signal(number)
+    started.communicate(timeout=20.0)
     assert started.returncode == code
+
+
+@pytest.mark.parametrize("by", ["", " by jointctl stop"])
+@pytest.mark.parametrize("where", ["check", "_loaded_joint_or_arm"])
+def test_an_interruption_that_leaves_a_verb_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], by: str, where: str
+) -> None:
+    """Typer would make a silent exit code of it, in the verb as well as while its options are built."""
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt(*([by] if by else []))
+
+    target = (
+        "jointctl.tools.output.Output.result" if where == "check" else f"{verb_options.__name__}.loaded_joint_or_arm"
+    )
+    monkeypatch.setattr(target, interrupted)
+    monkeypatch.setattr(sys, "argv", ["jointctl", "check", "virtual"])
+    for name in ("occupy_standard_streams", "never_refuse_a_character", "_start_quickly"):
+        monkeypatch.setattr(main_module, name, lambda: None)
+    monkeypatch.setattr(main_module.atexit, "register", lambda *_: None)
+    with pytest.raises(SystemExit) as raised:
+        main_module.main()
+    assert raised.value.code == INTERRUPTED
+    assert capsys.readouterr().err.splitlines()[-1] == f"interrupted{by}"
 
 
 @pytest.mark.parametrize(

@@ -126,6 +126,17 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
     assert "a remark" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("commanded_ns", "text"), [(1, " by jointctl stop"), (0, "")])
+def test_an_interruption_leaves_with_the_name_of_what_has_caused_it(commanded_ns: int, text: str) -> None:
+    with (  # noqa: PT012
+        pytest.raises(KeyboardInterrupt) as raised,
+        control_of("jointctl", f"test-{os.getpid()}", Output()) as held,
+    ):
+        held.signals.commanded_ns = commanded_ns
+        raise KeyboardInterrupt
+    assert str(raised.value) == text
+
+
 def test_an_arm_has_the_locks_of_all_its_buses_and_a_stop_by_any_is_one_stop(virtual_config: Any) -> None:
     def on(channel: str) -> Any:
         bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": f"{channel}-{os.getpid()}"})

@@ -415,8 +415,10 @@ def opening_raises(monkeypatch: pytest.MonkeyPatch) -> Opening:
         (can.CanInterfaceNotImplementedError("no driver"), "cannot be used here"),
         (can.CanInitializationError("wrong bit rate"), "cannot open pcan:x: wrong bit rate"),
         (ValueError("bad"), "cannot open pcan:x: bad"),
+        (NameError("name 'canOpen' is not defined", name="canOpen"), "library .*installed.*: canOpen is missing"),
+        (AttributeError("no attribute"), "cannot open pcan:x: the library of the adapter's maker .*: no attribute"),
         *((odd, "cannot open pcan:x") for odd in (
-            NameError("name 'canOpen' is not defined"), AttributeError("no attribute"), KeyError("x"),
+            KeyError("x"),
             ctypes.ArgumentError("argument 1"), AssertionError(), IndexError("list index"),
             RuntimeError("odd\nsecond line"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start byte"),
             RecursionError(), ZeroDivisionError(), Exception(),
@@ -431,6 +433,7 @@ def test_whatever_an_interface_raises_is_one_bus_error(
     with pytest.raises(BusError, match=words) as caught:
         open_python_can("pcan", "x")
     assert (caught.value.exit_code, caplog.records) == (4, [])  # what it logs is told once
+    assert "NameError" not in caught.value.message
     logging.getLogger("can.somewhere").warning("afterwards")
     assert len(caplog.records) == 1
 

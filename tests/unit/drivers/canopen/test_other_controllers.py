@@ -71,6 +71,34 @@ def test_frames_with_long_identifiers_and_those_of_errors_are_no_ones_command(ki
     assert others.found() == ""
 
 
+def asked(others: OtherControllers, identifier: int) -> str:
+    others.on_message_received(can.Message(arbitration_id=identifier, is_remote_frame=True, is_extended_id=False))
+    return others.found()
+
+
+@pytest.mark.parametrize(
+    ("identifier", "words"),
+    [
+        (0x700 + NODE, "1 x node guarding of node 5 (705h)"),
+        (0x700 + 9, "1 x node guarding of node 9 (709h)"),
+        (0x180 + NODE, "1 x remote request for a TPDO of node 5 (185h)"),
+        (0x480 + NODE, "1 x remote request for a TPDO of node 5 (485h)"),
+    ],
+)
+def test_a_master_that_only_asks_for_the_state_refuses_the_run(identifier: int, words: str) -> None:
+    others = listening()
+    assert asked(others, identifier) == words
+    with pytest.raises(BusError, match="another controller is active on this bus"):
+        others.refuse()
+
+
+@pytest.mark.parametrize("identifier", [0x700 + 7, 0x180 + 7, 0x580 + NODE, 0x700])
+def test_its_twin_who_asks_other_nodes_has_not_this_drive(identifier: int) -> None:
+    others = listening()
+    assert asked(others, identifier) == ""
+    assert others.heartbeats == set()  # it is not node 7 that has sent it
+
+
 def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
     others = listening()
     for node in (7, 3, 7, 1, 127, NODE):

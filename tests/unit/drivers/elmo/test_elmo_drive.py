@@ -16,7 +16,7 @@ from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import cycle_characters, highest_rate_Hz, measured_exchange
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.hil.elmo_drive import switch_off
-from jointctl.tools.verbs.elmo_bench import SHARED_ATTEMPTS
+from jointctl.tools.verbs.elmo_bench import SHARED_ATTEMPTS, PortTarget
 from tests.unit.drivers.elmo.virtual_line import COUNTS, SETTINGS, MemoryPort
 
 Answer = Callable[[bytes, bytes], bytes]
@@ -401,6 +401,22 @@ class TestMakeSafe:
         port.answer = lambda line, reply: b"" if next(lines) < 4 * SHARED_ATTEMPTS else reply
         state = commissioned.make_safe(asked=asked)
         assert state == "off" if asked else state.startswith("unknown: ")
+        assert port.device.m.motor_on == 0
+
+    @pytest.mark.parametrize(("disorder", "for_lines", "outlasted"), [(b"C\r?;", 20, True), (b"", 1000, False)])
+    def test_of_two_stops_on_one_line_the_first_tries_on_as_well(
+        self, port: MemoryPort, disorder: bytes, for_lines: int, outlasted: bool
+    ) -> None:
+        """It had the port for itself when it came; its twin on a line that is only silent gives up."""
+        port.device.execute(b"MO=1")
+        lines = itertools.count()
+        port.answer = lambda line, reply: disorder if next(lines) < for_lines else reply
+        target: Any = PortTarget("memory", 115_200, SETTINGS.reply_timeout_s)
+        if outlasted:
+            assert target._told(port, False) == "off"
+        else:
+            with pytest.raises(JointctlError):
+                target._told(port, False)
         assert port.device.m.motor_on == 0
 
 
