@@ -23,13 +23,12 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import KeptRecords, TimeSummary, histogram_times, summarise
-from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
-from jointctl.tools.session.plan import Placed, RunPlan, blamed
+from jointctl.tools.session.plan import Consent, Placed, RunPlan, blamed, prepare_log, require_ready
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import (
     Around,

@@ -125,7 +125,7 @@ def map_verb(
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.configuration.written_sections import with_map, write_changed
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.plan import require_terminal
 
     if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
         raise ConfigurationError(

@@ -50,8 +50,8 @@ def response(
     import contextlib
 
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import TerminalConsent, require_terminal
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
     from jointctl.tools.tuning.frequency_response import bode_figure
