@@ -38,8 +38,7 @@ from jointctl.firmware_py.states import (
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from jointctl.firmware_py.velocity import low_pass_gain, set_kalman_gains
 from jointctl.tools.configuration.checks import extremes_problems
-from jointctl.tools.configuration.config import Config, raise_if
-from jointctl.tools.configuration.control_section import Adaptation, Control
+from jointctl.tools.configuration.config import Adaptation, Config, Control, raise_if
 from jointctl.tools.configuration.conversions import (
     fill_series,
     friction_constants,

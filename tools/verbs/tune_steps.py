@@ -22,8 +22,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Control
+from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table

@@ -21,8 +21,7 @@ from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, spring_torque_Nm, step_plant
 from jointctl.tools import lockstep
 from jointctl.tools.configuration.canopen import canopen_settings
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Learning
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import changed, shipped, written
