@@ -273,7 +273,7 @@ class TuneStep:
 
 
 PlaceStep = Callable[[Config, LockstepJoint, TuneStep, float], PlacedSweep]
-"""The motion of a step for a joint that stands so far from its first point; `tuning.campaign_steps` has it."""
+"""The motion of a step for a joint that stands so far from its first point; `verbs.fault_campaign` has it."""
 
 
 def draw_step(random: np.random.Generator) -> TuneStep | None:
