@@ -43,9 +43,8 @@ from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, first_on_bus
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
-from jointctl.tools.virtual_joint import new_device
+from jointctl.tools.virtual_joint import arm_plant_of, new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
 _LISTENER_S = 5.0  # at most: it may have gone

@@ -42,7 +42,6 @@ from jointctl.tools.analysis.arm_check import pose_models
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config, first_on_bus
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     LATE_CAUSES,
@@ -74,6 +73,7 @@ from jointctl.tools.experiments.judge import (
     wrong_of_joint,
 )
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
+from jointctl.tools.virtual_joint import arm_plant_of
 
 # --- the scenario ---
 

@@ -33,13 +33,13 @@ from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
+from jointctl.tools.virtual_joint import plant_settings
 
 During = Literal["run", "sweep", "program", "tune"]
 

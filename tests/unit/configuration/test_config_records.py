@@ -30,9 +30,9 @@ from jointctl.tools.configuration.conversions import (
 )
 from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import approach_s, trajectory_table
 from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
 
