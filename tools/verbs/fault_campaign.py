@@ -154,9 +154,9 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
     from jointctl.tools.configuration.conversions import static_friction_Nm
     from jointctl.tools.experiments.fault_scenarios import PlacedSweep, placed_sweep
     from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan
+    from jointctl.tools.tuning.carry_out import response_task
     from jointctl.tools.tuning.excitation import motor_fed
     from jointctl.tools.tuning.found_values import with_break_away
-    from jointctl.tools.tuning.measured_response import response_task
     from jointctl.tools.tuning.tune_options import AS_IT_FITS
 
     # what the step of the direction finds, on this joint
