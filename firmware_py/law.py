@@ -21,12 +21,15 @@ from jointctl.firmware_py.flexible_joint import (
     reset_flexible,
     value_at,
 )
-from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
-from jointctl.firmware_py.friction_adaptation import (
+from jointctl.firmware_py.friction import (
+    Condition,
     adapt,
     adapted_feed_forward_Nm,
+    compensation_motor_torque_Nm,
+    condition_of,
     fed_before_Nm,
     reset_adaptation,
+    step_lugre,
     take_at_rest,
 )
 from jointctl.firmware_py.kernel import kernel, plain

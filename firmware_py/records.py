@@ -11,7 +11,7 @@ import numpy as np
 from jointctl.firmware_py.motion_records import ChangeConstants, ChangeState, Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
-# --- Friction: the model and what it depends on, its bristles, and what adapts (`friction_adaptation`) ---
+# --- Friction: the model and what it depends on, its bristles, and what adapts (`friction`) ---
 
 BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
 RIPPLES = 2  # sines of the motor angle that it finds
@@ -82,7 +82,7 @@ class LuGreConstants:
 
 @record
 class AdaptationConstants:
-    """See `friction_adaptation`."""
+    """See `friction`, the feed-forward that adapts."""
 
     enabled: i4
     ripples: i4  # sines in use
