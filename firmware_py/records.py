@@ -142,7 +142,7 @@ class NetworkState:
 
 @record
 class ObserverConstants:
-    """See `law.step_observer`; what follows the delay is that of `kalman.step_kalman`."""
+    """See `observers.step_observer`; what follows the delay is that of `observers.step_kalman`."""
 
     bandwidth_radps: f8  # 0 = off
     delay_cycles: i8  # from the command to the torque that it becomes

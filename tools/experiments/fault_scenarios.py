@@ -24,10 +24,10 @@ from typing import Any, Literal
 import numpy as np
 
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import reference_at
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import CONTROLLERS, loop_settings
 from jointctl.tools.analysis.loop_report import not_modelled
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm, require_margin
