@@ -24,9 +24,8 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.control import Control
-from jointctl.tools.session.display import Display
+from jointctl.tools.session.display import Display, run_display
 from jointctl.tools.session.fault_words import FaultText, fault_text
-from jointctl.tools.session.live_panel import run_display
 from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session

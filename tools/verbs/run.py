@@ -101,8 +101,7 @@ def _displays(
 ) -> Iterator[Callable[[CommissioningReport], Display]]:
     """What shows the run: the terminal, and the page if one is wanted."""
     from jointctl.tools.recording.ros_messages import JOINT_NAMES
-    from jointctl.tools.session.display import Displays
-    from jointctl.tools.session.live_panel import run_display
+    from jointctl.tools.session.display import Displays, run_display
 
     terminal = run_display(output, title)
     if scope is None:
