@@ -306,7 +306,7 @@ class EventFinder:
         self._fault_words = fault_words
         self._last: tuple[int, ...] | None = None
 
-    def take(self, records: Any) -> list[Event]:
+    def take(self, records: np.recarray) -> list[Event]:
         """Events in the new records (array of LogRecord, shape (N,)), in order of time."""
         if not len(records):
             return []

@@ -19,6 +19,7 @@ import numpy as np
 from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import BusError, JointctlError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
@@ -131,7 +132,7 @@ class RunPlan:
 class JointMotion(Motion, Protocol):
     """That of one joint of an arm."""
 
-    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+    def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint will go; `axis`: its `AxisConstants` in the arm."""
 
 
@@ -249,7 +250,7 @@ class FreeMotion:
             expect_client(constants, config)
         return Placed(constants, self.table, tuple(self.envelope(constants[0], report)))
 
-    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+    def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint stands, and who may move it."""
         what = "none: the joint holds its place"
         if axis.stream.client_timeout_ns:
@@ -291,7 +292,7 @@ class ConfiguredMotion:
                 'give it time, sequence.approach_s = "auto"; without, it would be pulled there with all its torque',
             )
 
-    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+    def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint will go, how fast, with how much torque, for how long."""
         config = self.config
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)

@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
+
+import numpy as np
 
 from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
@@ -64,7 +66,7 @@ def spread_text(spread: TimeSummary | None) -> tuple[int, str, str] | None:
     )
 
 
-def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
+def came_before(fault: Fault, records: np.recarray, time_ns: int) -> bool:
     """Whether the loop had latched its fault by then, and not by what `jointctl stop` did to the drive.
 
     Its request is sent first, but a program that is busy may take note of it after the drive has been stopped.
@@ -243,7 +245,7 @@ class Session:
             return self._carry_out(drives, loop, placed.constants, reports, watches)
 
     def _carry_out(
-        self, drives: DriveGroup, loop: LoopHandle, constants: Any, reports: Sequence[CommissioningReport],
+        self, drives: DriveGroup, loop: LoopHandle, constants: np.recarray, reports: Sequence[CommissioningReport],
         watches: Sequence[RunWatch],
     ) -> RunResult:  # fmt: skip
         watch = watches[0]

@@ -194,7 +194,7 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     return found, records, plan
 
 
-def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: Any, fit: JointFit) -> None:
+def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarray, fit: JointFit) -> None:
     """`MotionFault` where the halves of the legs are of two joints; where too few legs are left nothing is compared."""
     parts = [replace(plan, legs=replace(plan.legs, starts=starts)) for starts in np.array_split(plan.legs.starts, 2)]
     with contextlib.suppress(DataError):

@@ -15,6 +15,8 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
     from jointctl.tools.configuration.config import Config
 
@@ -71,7 +73,7 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     return torque.model_copy(update={"trajectory": motion})
 
 
-def map_run(config: Config, records: Any, late_s: float) -> MapRun:
+def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:
     """What the log of such a motion says; `late_s`: from a command to its torque."""
     from jointctl.tools.analysis.reducer_map import MapRun, late_torque_Nm, tracked
 
