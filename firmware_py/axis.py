@@ -12,6 +12,7 @@ from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step
 from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.motion_records import MotionChange, Reference
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -66,7 +67,6 @@ from jointctl.firmware_py.trajectory import (
     reference_at,
     repetition,
 )
-from jointctl.firmware_py.velocity import step_velocity
 
 # --- One tick of one joint: sample in, command out ---
 # position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit

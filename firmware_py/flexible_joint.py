@@ -29,9 +29,9 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import KNEES, FlexibleConstants, FlexibleState, HarmonicSeries, LawConstants, LawState
 from jointctl.firmware_py.states import Encoders
-from jointctl.firmware_py.velocity import step_velocity
 
 
 class Reading(NamedTuple):

@@ -1,4 +1,4 @@
-"""The control law: PID, adaptive network, iterative learning, and their sums with `disturbance_observer`.
+"""The control law: PID, adaptive network, iterative learning, and their sums with the disturbance observer.
 
 Those are computed torque, and the law for a joint whose reducer is not rigid (`flexible_joint`)."""
 
@@ -6,14 +6,6 @@ from __future__ import annotations
 
 import math
 
-from jointctl.firmware_py.disturbance_observer import (
-    AVERAGE_s,
-    add_to_disturbance,
-    applied_torque_Nm,
-    known_since_Nm,
-    reset_observer,
-    step_observer,
-)
 from jointctl.firmware_py.flexible_joint import (
     Reading,
     desired_motor,
@@ -21,16 +13,28 @@ from jointctl.firmware_py.flexible_joint import (
     reset_flexible,
     value_at,
 )
-from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
-from jointctl.firmware_py.friction_adaptation import (
+from jointctl.firmware_py.friction import (
+    Condition,
     adapt,
     adapted_feed_forward_Nm,
+    compensation_motor_torque_Nm,
+    condition_of,
     fed_before_Nm,
     reset_adaptation,
+    step_lugre,
     take_at_rest,
 )
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import (
+    AVERAGE_s,
+    add_to_disturbance,
+    applied_torque_Nm,
+    known_since_Nm,
+    reset_observer,
+    step_kalman,
+    step_observer,
+)
 from jointctl.firmware_py.records import (
     LEARNING_BINS,
     NEURONS,
@@ -44,7 +48,6 @@ from jointctl.firmware_py.records import (
 )
 from jointctl.firmware_py.states import ControllerKind, FeedForward
 from jointctl.firmware_py.trajectory import Repetition
-from jointctl.firmware_py.velocity import step_kalman
 
 # --- PID on the joint's inertia, the honest baseline: no model but J ---
 # tau = J (q_d'' - kd e' - kp e - ki int(e) dt)

@@ -29,6 +29,7 @@ from jointctl.firmware_py.motion_records import (
     MotionChange,
     TrajectoryConstants,
 )
+from jointctl.firmware_py.observers import set_kalman_gains
 from jointctl.firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants
 from jointctl.firmware_py.safety import within
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
@@ -41,7 +42,6 @@ from jointctl.firmware_py.trajectory import (
     reference_at,
     trapezoid_times_s,
 )
-from jointctl.firmware_py.velocity import set_kalman_gains
 
 REST_radps = 1e-9  # what rounding leaves of the velocity at a crest
 _LONGEST_s = 1e9

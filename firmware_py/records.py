@@ -11,7 +11,7 @@ import numpy as np
 from jointctl.firmware_py.motion_records import ChangeConstants, ChangeState, Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
-# --- Friction: the model and what it depends on, its bristles, and what adapts (`friction_adaptation`) ---
+# --- Friction: the model and what it depends on, its bristles, and what adapts (`friction`) ---
 
 BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
 RIPPLES = 2  # sines of the motor angle that it finds
@@ -82,7 +82,7 @@ class LuGreConstants:
 
 @record
 class AdaptationConstants:
-    """See `friction_adaptation`."""
+    """See `friction`, the feed-forward that adapts."""
 
     enabled: i4
     ripples: i4  # sines in use
@@ -142,7 +142,7 @@ class NetworkState:
 
 @record
 class ObserverConstants:
-    """See `law.step_observer`; what follows the delay is that of `kalman.step_kalman`."""
+    """See `observers.step_observer`; what follows the delay is that of `observers.step_kalman`."""
 
     bandwidth_radps: f8  # 0 = off
     delay_cycles: i8  # from the command to the torque that it becomes

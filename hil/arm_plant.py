@@ -15,7 +15,7 @@ Not modelled: set-valued friction (`FrictionKind.STICK_SLIP`), the gyroscopic to
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,7 @@ def no_arm_plant() -> ArmPlant:
     return ArmPlant(new(ArmPlantConstants), new(ArmLink, 0), new(JointOfArm, MOST_JOINTS + 1), np.zeros(1, np.int64))
 
 
-def arm_plant(links: Any, gravity_mps2: tuple[float, ...]) -> ArmPlant:
+def arm_plant(links: np.ndarray, gravity_mps2: tuple[float, ...]) -> ArmPlant:
     """Links as the arm truly has them, at rest and braked; of a flexible joint the motor is not the link's."""
     if len(links) > MOST_JOINTS:
         raise ValueError(f"joints of an arm (={len(links)}) must be at most {MOST_JOINTS}")

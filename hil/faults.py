@@ -250,7 +250,7 @@ def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
 
 @kernel
 def _unstamp(frame: np.ndarray) -> None:
-    """A frame that the wire makes late or doubles shall count when it comes: see `hil.frame_stamps`."""
+    """A frame that the wire makes late or doubles shall count when it comes: see `hil.bus_timing`."""
     for i in range(5, 8):
         frame[i] = 0
 

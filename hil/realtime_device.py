@@ -36,6 +36,7 @@ from jointctl.firmware_py.libc import (
 )
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
+from jointctl.hil.bus_timing import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
@@ -49,7 +50,6 @@ from jointctl.hil.faults import (
     step_faults,
     take_due,
 )
-from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 ENETDOWN = errno_codes.ENETDOWN

@@ -7,7 +7,7 @@ and never holds up the others.
 
 With `timing`, bit times and arbitration are modelled (`hil/bus_timing.py`) and a frame takes its time; a client that
 sends faster than the bus finds its queue full.  Without it, frames are forwarded at once and only counted.
-That a busy computer holds the hub itself up is made up for with `hil/frame_stamps.py`.
+That a busy computer holds the hub itself up is made up for with the stamps of `hil/bus_timing.py`.
 
 Not modelled: acknowledge (a lone node sends successfully), bit errors, error frames, error counters and bus-off,
 overload frames, CAN FD, the delay and queueing inside an adapter."""
@@ -33,8 +33,19 @@ from jointctl.firmware_py import libc
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import errno, load_acquire, monotonic_ns, store_release
 from jointctl.firmware_py.schema import array_of, i4, i8, new, record, u1, u4
-from jointctl.hil.bus_timing import NO_NODE, Waiting, Wire, finish_frame, frame_bits, pend_frame
-from jointctl.hil.frame_stamps import SyncWatch, note_sent, outlived, over, stamp_of
+from jointctl.hil.bus_timing import (
+    NO_NODE,
+    SyncWatch,
+    Waiting,
+    Wire,
+    finish_frame,
+    frame_bits,
+    note_sent,
+    outlived,
+    over,
+    pend_frame,
+    stamp_of,
+)
 
 # --- The virtual side's own statement of `struct can_frame` (16 bytes): identifier, length, three spare bytes, data ---
 # Deliberately not shared with the drivers: a wrong constant on one side must not cancel out on the other.

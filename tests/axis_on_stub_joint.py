@@ -11,6 +11,7 @@ from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.friction import paper_friction
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import solve_lyapunov_p
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.records import NEURONS, AxisConstants, AxisState, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
@@ -24,7 +25,6 @@ from jointctl.firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
-from jointctl.firmware_py.velocity import low_pass_gain
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1

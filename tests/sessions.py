@@ -11,9 +11,8 @@ from typing import Any
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
-from jointctl.tools.session.consent import TerminalConsent
 from jointctl.tools.session.control import Control, StopSignals
-from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.plan import TerminalConsent, resolve
 from jointctl.tools.session.session import Session
 
 

@@ -50,7 +50,6 @@ from jointctl.hil.virtual_bus import FrameQueue
 from jointctl.tools.configuration.arm import ArmConfig, ArmModel
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, first_on_bus
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
 from jointctl.tools.session import loop_memory, portable_loop
@@ -58,7 +57,7 @@ from jointctl.tools.session import session as session_module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
-from jointctl.tools.virtual_joint import new_devices
+from jointctl.tools.virtual_joint import arm_plant_of, new_devices
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5

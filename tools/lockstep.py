@@ -22,7 +22,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import Arm, no_arm
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.kernel import bound
-from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -43,9 +43,8 @@ from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, first_on_bus
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
-from jointctl.tools.virtual_joint import new_device
+from jointctl.tools.virtual_joint import arm_plant_of, new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
 _LISTENER_S = 5.0  # at most: it may have gone
@@ -102,7 +101,7 @@ class DirectBus(can.BusABC):
         return decode(frame, self.now_ns * 1e-9, self.channel_info), False
 
 
-def codec_of(port: Any) -> Codec:
+def codec_of(port: np.recarray) -> Codec:
     """The CANopen driver's codec on this `CanopenPort` array."""
     link = link_of(port)
     frame_bytes = link.frames.view(np.ndarray).view(np.uint8).reshape(len(link.frames), FRAME_SIZE)
@@ -132,7 +131,9 @@ class LockstepRun:
         return np.asarray(self.truth[:, TRUE_POSITION_rad] - self.log.desired_position_rad)
 
 
-def _memory(constants: Any, state: Any, tables: np.ndarray, log: Any, arm: Arm | None = None) -> CycleMemory:
+def _memory(
+    constants: np.recarray, state: np.recarray, tables: np.ndarray, log: np.recarray, arm: Arm | None = None
+) -> CycleMemory:
     axes = len(state)
     return CycleMemory(
         constants, state, tables, new(Sample, axes), new(Command, axes), np.zeros(WORDS, np.int64), log,
@@ -220,7 +221,7 @@ class LockstepJoint:
         constants[0].sequence.supervisor_max_cycles = 0  # nobody to watch: simulated time has no wall clock
         return constants
 
-    def stepped(self, constants: Any, table: np.ndarray, records: int = STEP_RECORDS) -> SteppedRun:
+    def stepped(self, constants: np.recarray, table: np.ndarray, records: int = STEP_RECORDS) -> SteppedRun:
         """A run that goes on when it is asked to; `table` float64 (N, 5) as in `reference_at`."""
         state = new(AxisState)
         reset_axis(constants[0], state[0])
@@ -239,10 +240,10 @@ class LockstepJoint:
 
     def run(
         self,
-        constants: Any = None,
+        constants: np.recarray | None = None,
         *,
-        plant_constants: Any = None,
-        plant_state: Any = None,
+        plant_constants: np.recarray | None = None,
+        plant_state: np.recarray | None = None,
         log_every: int = 1,
         stop_cycle: int = NO_STOP,
         longest_s: float | None = None,
@@ -270,7 +271,7 @@ class LockstepJoint:
             table=table, log_every=log_every, cycles=cycles, stop_cycle=stop_cycle, ideal_velocity=ideal_velocity,
         )  # fmt: skip
 
-    def run_as_configured(self, constants: Any, table: np.ndarray, log_every: int = 1) -> LockstepRun:
+    def run_as_configured(self, constants: np.recarray, table: np.ndarray, log_every: int = 1) -> LockstepRun:
         """A motion with the [[virtual.faults]] of the configuration, if any; they begin with each motion anew."""
         constants[0].sequence.supervisor_max_cycles = 0
         self.table = table
@@ -280,11 +281,11 @@ class LockstepJoint:
 
     def run_with_faults(
         self,
-        faults: Any,
-        constants: Any = None,
+        faults: np.ndarray,
+        constants: np.recarray | None = None,
         *,
-        plant_constants: Any = None,
-        plant_state: Any = None,
+        plant_constants: np.recarray | None = None,
+        plant_state: np.recarray | None = None,
         epoch_at_start: bool = False,
         stop_cycle: int = NO_STOP,
         longest_s: float | None = None,
@@ -307,7 +308,7 @@ class LockstepJoint:
         )  # fmt: skip
 
     @staticmethod
-    def _longest_cycles(axis: Any, longest_s: float | None) -> int:
+    def _longest_cycles(axis: AxisConstants, longest_s: float | None) -> int:
         """How many cycles a run may take; by default ten seconds more than approach and trajectory together."""
         if longest_s is None:
             longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
@@ -315,12 +316,12 @@ class LockstepJoint:
 
     def _carry_out(
         self,
-        constants: Any,
-        plant_constants: Any,
-        plant_state: Any,
-        log: Any,
+        constants: np.recarray,
+        plant_constants: np.recarray | None,
+        plant_state: np.recarray | None,
+        log: np.recarray,
         truth: np.ndarray,
-        faults: Any = NO_FAULTS,
+        faults: np.ndarray = NO_FAULTS,
         epoch_ns: int = 0,
         table: np.ndarray | None = None,
         **how: Any,
@@ -369,14 +370,14 @@ class LockstepArm:
         self.reports = [joint.report for joint in joints]
         self._thermometer = all(joint._settings.temperature is not None for joint in joints)
 
-    def stepped(self, constants: Any, tables: np.ndarray) -> SteppedRun:
+    def stepped(self, constants: np.recarray, tables: np.ndarray) -> SteppedRun:
         """A run that goes on when it is asked to; `tables` float64 (axes, rows, 5)."""
         memory = self._memory(constants, tables, STEP_RECORDS, self.arm.model.memory())
         world = self._world((self.plant_constants, self.plant_state), arm_plant_of(self.arm))
         return SteppedRun(memory, codec_of(self._ports.copy()), world, self.start_ns, thermometer=self._thermometer)
 
     @staticmethod
-    def _memory(constants: Any, tables: np.ndarray, records: int, model: Arm) -> CycleMemory:
+    def _memory(constants: np.recarray, tables: np.ndarray, records: int, model: Arm) -> CycleMemory:
         """The loop's, as a run begins; `records`: for each axis."""
         state = new(AxisState, len(constants))
         for axis, its_constants in zip(state, constants, strict=True):
@@ -391,11 +392,11 @@ class LockstepArm:
 
     def run(
         self,
-        constants: Any = None,
+        constants: np.recarray | None = None,
         *,
         model: Arm | None = None,
         plant: ArmPlant | None = None,
-        plant_constants: Any = None,
+        plant_constants: np.recarray | None = None,
         longest_s: float | None = None,
         log_every: int = 1,
         stop_cycle: int = NO_STOP,
@@ -415,9 +416,9 @@ class LockstepArm:
 
     def run_with_faults(
         self,
-        faults: Any,
+        faults: np.ndarray,
         faulty: int,
-        constants: Any,
+        constants: np.recarray,
         plants: tuple[Any, Any],
         plant: ArmPlant,
         *,
@@ -442,7 +443,7 @@ class LockstepArm:
             bus=np.array(first_on_bus(self.arm.joints)),
         )  # fmt: skip
 
-    def _carry_out(self, constants: Any, model: Arm, world: World, **how: Any) -> list[LockstepRun]:
+    def _carry_out(self, constants: np.recarray, model: Arm, world: World, **how: Any) -> list[LockstepRun]:
         """`how`: fields of `Scenario`."""
         constants = constants.copy()
         axes = len(constants)

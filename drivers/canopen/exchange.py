@@ -101,7 +101,7 @@ class CanopenLink(NamedTuple):
     scratch: np.ndarray  # int64[SCRATCH_WORDS or more]
 
 
-def link_of(port: Any) -> CanopenLink:
+def link_of(port: np.recarray) -> CanopenLink:
     """`port` CanopenPort[axes] with the other memory of the exchange."""
     return CanopenLink(port, new(Frame, FRAME_SLOTS), np.zeros(max(SCRATCH_WORDS, len(port) + 2), np.int64))
 

@@ -40,7 +40,7 @@ _GONE_EVENTS = 0x008 | 0x010 | 0x020  # POLLERR, POLLHUP, POLLNVAL
 _EIO = errno_codes.EIO
 
 
-def link_of(port: Any) -> ElmoLink:
+def link_of(port: np.recarray) -> ElmoLink:
     """`port` ElmoPort[1] with the other memory of the exchange."""
     return ElmoLink(port, np.zeros(READ_MAX, np.uint8), np.zeros(SCRATCH_WORDS, np.int64))
 

@@ -15,14 +15,6 @@ import numpy as np
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.hil.arm_plant import ArmPlant, step_arm
 from jointctl.hil.canopen.cia402_core import (
-    abort_connection,
-    apply_controlword,
-    outside_position_limit,
-    power_off,
-    raise_fault,
-    status_word,
-)
-from jointctl.hil.canopen.device_errors import (
     FOLLOWING_ERROR,
     HEARTBEAT_ERRORS,
     HEARTBEAT_LOST,
@@ -35,13 +27,19 @@ from jointctl.hil.canopen.device_errors import (
     SYNC_LENGTH,
     SYNC_LENGTH_ERROR,
     SYNC_LOST,
+    abort_connection,
+    apply_controlword,
     clear_error,
     error_register,
+    outside_position_limit,
+    power_off,
     push_frame,
     raise_error,
+    raise_fault,
     report_error,
     send_emergency,
     send_waiting_emergencies,
+    status_word,
 )
 from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
 from jointctl.hil.canopen.motion import (

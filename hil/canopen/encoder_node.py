@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.canopen.device_errors import COB_ID_INVALID, push_frame
+from jointctl.hil.canopen.cia402_core import COB_ID_INVALID, push_frame
 from jointctl.hil.canopen.dictionary import ObjectDictionary, check_write, field_view, load_entries
 from jointctl.hil.canopen.records import (
     ENCODER_FIELDS,

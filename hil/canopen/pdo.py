@@ -13,12 +13,12 @@ from __future__ import annotations
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.canopen.cia402_core import apply_controlword
-from jointctl.hil.canopen.device_errors import (
+from jointctl.hil.canopen.cia402_core import (
     COB_ID_INVALID,
     RPDO_ERROR,
     RPDO_LENGTH_ERROR,
     RPDO_TOO_SHORT,
+    apply_controlword,
     clear_error,
     push_frame,
     raise_error,

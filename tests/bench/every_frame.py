@@ -47,14 +47,17 @@ from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
-from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
 from jointctl.tools.session.control import (  # noqa: E402
     STOP_COMMAND,
     Control,
     StopSignals,
 )
 from jointctl.tools.session.display import PhaseLines  # noqa: E402
-from jointctl.tools.session.plan import resolve, resolve_arm  # noqa: E402
+from jointctl.tools.session.plan import (  # noqa: E402
+    TerminalConsent,
+    resolve,
+    resolve_arm,
+)
 from jointctl.tools.session.result import RunResult  # noqa: E402
 from jointctl.tools.session.session import Session  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402

@@ -20,10 +20,10 @@ import typer
 from rich.table import Column, Table
 
 from jointctl.firmware_py.friction import DEGREE, branch_torque_Nm, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.fit import NAMES
 from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.identification import DIRECTIONS, Options, identify_friction
 from jointctl.tools.identification.swarm import SwarmSettings
-from jointctl.tools.identification.uncertainty import NAMES
 from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import grid_speeds
 

@@ -20,11 +20,11 @@ from numba.core import runtime
 from jointctl.firmware_py.axis import law_torque_Nm
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import network_torque_Nm, reset_law, step_law
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import AxisConstants, AxisState
 from jointctl.firmware_py.safety import limited_torque_Nm
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import NO_REPETITION, repetition
-from jointctl.firmware_py.velocity import step_velocity
 from tests.bench.c_programs import (
     FAST_MATH,
     OPTIMISED,

@@ -31,7 +31,7 @@ from jointctl.tools.identification.motion_fit import identify_motion
 from jointctl.tools.identification.motion_report import motion_section
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.output import Output
-from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.sweeping.carry_out import config_of_sweep, lockstep_log
 from jointctl.tools.sweeping.excitation import Design, ExcitePass, designed
 from jointctl.tools.verbs.identify import motion_from

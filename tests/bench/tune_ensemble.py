@@ -45,7 +45,7 @@ from jointctl.tools.experiments.controller_study import EnsembleSettings, random
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
-from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
+from jointctl.tools.session.plan import TerminalConsent  # noqa: E402
 from jointctl.tools.tuning.carry_out import Carried, Carrier  # noqa: E402
 from jointctl.tools.tuning.excitation import config_of_response, multisine, speed_and_period  # noqa: E402
 from jointctl.tools.tuning.found_values import SMALL_MOTION, values_of_fit, with_values  # noqa: E402

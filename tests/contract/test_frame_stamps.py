@@ -19,9 +19,7 @@ from jointctl.drivers.canopen.exchange import end, link_of, receive
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.hil import virtual_bus
-from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.faults import FaultKind, no_faults
-from jointctl.hil.frame_stamps import (
+from jointctl.hil.bus_timing import (
     OLDEST_STAMP_NS,
     SHORTEST_WINDOW_US,
     SyncWatch,
@@ -32,6 +30,8 @@ from jointctl.hil.frame_stamps import (
     stamp_frame,
     stamp_of,
 )
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.faults import FaultKind, no_faults
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.hil.realtime_device import RealtimeDevice

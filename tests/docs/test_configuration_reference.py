@@ -6,8 +6,8 @@ import tomllib
 
 import pytest
 
+from docs.reference import reference, rows_of
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.reference import reference, rows_of
 from jointctl.tools.configuration.sections import Limits
 from tests.places import ROOT
 
@@ -18,7 +18,7 @@ def page() -> str:
 
 
 def test_the_page_is_up_to_date(page: str) -> None:
-    told = "is stale: python -m jointctl.tools.configuration.reference docs/configuration.md"
+    told = "is stale: python docs/reference.py docs/configuration.md"
     assert (ROOT / "docs" / "configuration.md").read_text() == page, told
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 
+from docs.reference import UNITS
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Notice
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.reference import UNITS
 from jointctl.tools.identification.friction_data import SWEEP_COLUMNS
 from jointctl.tools.recording.ros_messages import (
     CAN_TOPIC,

@@ -32,7 +32,7 @@ from jointctl.tools.experiments.arm_campaign import (
 from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, kinds_during
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
-from jointctl.tools.verbs.fault_campaign import fault_campaign
+from jointctl.tools.verbs.fault_campaign import Drawn, fault_campaign
 from tests.sessions import output
 from tests.unit.hil.test_lockstep_arm import on_two_buses
 
@@ -237,11 +237,11 @@ def test_the_envelope_follows_its_derivation(arm: ArmConfig, joints: LockstepArm
 
 def test_the_verb_takes_an_arm_and_replays_one_scenario(arm: ArmConfig, tmp_path: Path) -> None:
     shown, out, _ = output(json=True)
-    assert fault_campaign(arm, shown, count=3, seed=5, folder=tmp_path / "new", workers=Workers(1)) == 0
+    assert fault_campaign(arm, shown, drawn=Drawn(count=3, seed=5), folder=tmp_path / "new", workers=Workers(1)) == 0
     assert json.loads(out.getvalue())["scenarios"] == 3
     assert json.loads((tmp_path / "new" / "campaign.json").read_text())["violations"] == []
     shown, out, _ = output(json=True)
-    assert fault_campaign(arm, shown, seed=5, scenario=40) == 0
+    assert fault_campaign(arm, shown, drawn=Drawn(seed=5, scenario=40)) == 0
     told = json.loads(out.getvalue())
     assert told["scenario"]["joint"] == 1
     assert len(told["scenario"]["joints"]) == 3
@@ -251,7 +251,7 @@ def test_the_verb_takes_an_arm_and_replays_one_scenario(arm: ArmConfig, tmp_path
 def test_what_is_one_joints_is_refused_and_so_is_an_arm_that_proves_nothing(arm: ArmConfig) -> None:
     shown, _, _ = output()
     with pytest.raises(UsageError, match=r"--sweep is one joint's, and .*arm.toml is an arm"):
-        fault_campaign(arm, shown, sweep=True)
+        fault_campaign(arm, shown, during="sweep")
     slow = arm.joints[1].model_copy(
         update={"limits": arm.joints[1].limits.model_copy(update={"velocity_max_radps": 0.9})}
     )

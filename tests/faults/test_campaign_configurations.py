@@ -32,8 +32,7 @@ from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.tuning.campaign_steps import placed_step
-from jointctl.tools.verbs.fault_campaign import fault_campaign
+from jointctl.tools.verbs.fault_campaign import Drawn, fault_campaign, placed_step
 from tests.configurations import shipped
 from tests.faults.campaign_variants import VARIANTS, write_variant
 from tests.faults.test_fault_campaign import REVERSED, WIDE, good_run
@@ -115,9 +114,12 @@ def test_the_command_that_replays_a_violation_names_the_sweep(tmp_path: Path, mo
     err = StringIO()
     shown = Output(json=True, stdout=StringIO(), stderr=err)
     config = load_config(CONFIGS / "sweep_virtual.toml")
-    assert fault_campaign(config, shown, count=1, seed=5, folder=tmp_path, workers=Workers(1), sweep=True) == 10
+    assert (
+        fault_campaign(config, shown, drawn=Drawn(count=1, seed=5), folder=tmp_path, workers=Workers(1), during="sweep")
+        == 10
+    )
     assert "sweep_virtual.toml --sweep --seed 5 --scenario 0" in err.getvalue()
-    assert fault_campaign(config, shown, seed=5, scenario=0, sweep=True) == 10
+    assert fault_campaign(config, shown, drawn=Drawn(seed=5, scenario=0), during="sweep") == 10
 
 
 # --- during a tune ---

@@ -29,7 +29,7 @@ from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, dr
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from jointctl.tools.verbs.fault_campaign import fault_campaign
+from jointctl.tools.verbs.fault_campaign import Drawn, fault_campaign
 from tests.page_figures import foreign_colours, svgs
 from tests.places import CONFIGS
 from tests.sessions import output
@@ -205,7 +205,9 @@ def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) 
     shown, out, _ = output(json=True)
     page = tmp_path / "campaign.html"
     assert (
-        fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=Workers(1), report=page)
+        fault_campaign(
+            config, shown, drawn=Drawn(count=KINDS, seed=5), folder=tmp_path / "new", workers=Workers(1), report=page
+        )
         == 0
     )
     assert [foreign_colours(svg) for svg in svgs(page.read_text())] == [set()]
@@ -224,7 +226,10 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
     monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
     shown, _, err = output(json=True)
     page = tmp_path / "campaign.html"
-    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=Workers(1), report=page) == 10
+    assert (
+        fault_campaign(config, shown, drawn=Drawn(count=2, seed=5), folder=tmp_path, workers=Workers(1), report=page)
+        == 10
+    )
     assert page.read_text().count("made up") == 2
     assert "--seed 5 --scenario 0" in err.getvalue()
     report = json.loads((tmp_path / "campaign.json").read_text())
@@ -234,7 +239,7 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
 
 def test_one_scenario_is_replayed(config: Config) -> None:
     shown, out, _ = output(json=True)
-    assert fault_campaign(config, shown, seed=5, scenario=7) == 0
+    assert fault_campaign(config, shown, drawn=Drawn(seed=5, scenario=7)) == 0
     data = json.loads(out.getvalue())
     assert data["scenario"]["number"] == 7
     assert data["verdict"]["number"] == 7
@@ -250,7 +255,7 @@ def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Workers, "results", three)
     shown, out, _ = output(json=True)
-    assert fault_campaign(config, shown, count=100, folder=tmp_path) == 130
+    assert fault_campaign(config, shown, drawn=Drawn(count=100), folder=tmp_path) == 130
     data = json.loads(out.getvalue())
     assert (data["scenarios"], data["interrupted"]) == (3, True)
     assert json.loads((tmp_path / "campaign.json").read_text())["scenarios"] == 3

@@ -27,7 +27,7 @@ from tests.made_faults import faults_of, one_fault
 NODE = 1
 MS = 1_000_000
 EPOCH_ns = 7 * MS
-STAMP = (7, 8, 9)  # when it was sent, see hil.frame_stamps
+STAMP = (7, 8, 9)  # when it was sent, see hil.bus_timing
 SYNC, RPDO, OWN_HEARTBEAT = (0x80, 0), (0x201, 4), (0x77E, 1)
 TPDO, HEARTBEAT, EMCY = (0x181, 8), (0x701, 1), (0x81, 8)
 TO_DRIVE, TO_CONTROLLER = (SYNC, RPDO, OWN_HEARTBEAT), (TPDO, HEARTBEAT, EMCY)

@@ -19,9 +19,9 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.plant_settings import fault_constants
 from jointctl.tools.configuration.sections import FAULT_KINDS
 from jointctl.tools.session.result import RunResult
+from jointctl.tools.virtual_joint import fault_constants
 from tests.configurations import written
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint

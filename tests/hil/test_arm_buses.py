@@ -19,10 +19,9 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import load_arm
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.experiments.judge import POWERED
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.virtual_joint import new_devices
+from jointctl.tools.virtual_joint import arm_plant_of, new_devices
 from tests.hil.test_arm_run import NAMES, OFF, ArmBench
 from tests.real_time_joint import schedule_compiled
 

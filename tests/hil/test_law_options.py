@@ -11,8 +11,7 @@ import pytest
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Learning
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.experiments.controllers import (
     Controller,
     changed,

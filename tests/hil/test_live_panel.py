@@ -18,8 +18,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log_reader import missing_records
-from jointctl.tools.session.display import PhaseLines, Snapshot
-from jointctl.tools.session.live_panel import LivePanel, panel, run_display, time_left
+from jointctl.tools.session.display import LivePanel, PhaseLines, Snapshot, panel, run_display, time_left
 from tests.hil.terminal import Terminal, opened_terminal
 
 ESCAPE = "\x1b["

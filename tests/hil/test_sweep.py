@@ -212,7 +212,7 @@ def test_each_load_is_asked_for_and_without_it_nothing_moves(
         measured.append(points[0].condition.load_Nm)
         return ""
 
-    monkeypatch.setattr("jointctl.tools.session.consent.agreed", answer)
+    monkeypatch.setattr("jointctl.tools.session.plan.agreed", answer)
     command = Sweep(config, output()[0], tmp_path / "data.csv", SweepOptions(points=4, loads_Nm=[0.0, 8.0]))
     monkeypatch.setattr(command, "_measure", measure)
     assert command.run() == DECLINED

@@ -13,14 +13,14 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.output import Output
-from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.response import response
 from jointctl.tools.verbs.tune import tune
 from jointctl.tools.verbs.tune_steps import Tune
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written
 
 IN_LOCKSTEP = ResponseOptions(lockstep=True)

@@ -20,8 +20,7 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.output import Output
-from jointctl.tools.session.consent import TerminalConsent
-from jointctl.tools.session.plan import Motion
+from jointctl.tools.session.plan import Motion, TerminalConsent
 from jointctl.tools.tuning.carry_out import Carried, Carrier
 from jointctl.tools.tuning.tune_options import TuneOptions
 from jointctl.tools.verbs.tune_steps import Tune

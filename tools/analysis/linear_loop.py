@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
+from jointctl.firmware_py.observers import kalman_gains, low_pass_gain
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.firmware_py.velocity import kalman_gains, low_pass_gain
 from jointctl.tools.configuration.records import encoders_of_law, hidden_layer
 
 if TYPE_CHECKING:

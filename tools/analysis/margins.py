@@ -23,7 +23,7 @@ from jointctl.tools.analysis.linear_loop import (
     linear_loop,
     network_gains,
 )
-from jointctl.tools.configuration.control_section import Learning
+from jointctl.tools.configuration.config import Learning
 
 # --- zeros and minima by a grid that shrinks round by round: every start of a motion would wait for scipy.optimize ---
 

@@ -199,7 +199,7 @@ def late_torque_Nm(command_Nm: np.ndarray, period_s: float, late_s: float) -> np
     return np.interp(cycles, np.arange(len(command_Nm)), command_Nm)
 
 
-def tracked(records: Any) -> Any:
+def tracked(records: np.recarray) -> Any:
     """The rows of a log in which the trajectory is followed."""
     rows: LogRecord = records[records.phase == AxisPhase.TRACKING]
     return rows

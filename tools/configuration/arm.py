@@ -392,7 +392,7 @@ def _model(arm: ArmSection, bodies: list[Body], inertias: tuple[float, ...]) -> 
     return ArmModel(constants, links)
 
 
-def fill_link(link: Any, body: Body, motor_inertia_kgm2: float) -> None:
+def fill_link(link: ArmLink, body: Body, motor_inertia_kgm2: float) -> None:
     """The record of a link."""
     link.parent = body.parent
     link.kind = JointKind.PRISMATIC if body.joint.kind == "prismatic" else JointKind.REVOLUTE

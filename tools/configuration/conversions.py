@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.sections import Friction, FrictionDirection, FrictionTemperature, Section
+
+if TYPE_CHECKING:
+    from jointctl.firmware_py.records import FrictionConstants, HarmonicSeries
+
 
 RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
 HELD_BEYOND_K = 40.0  # of the reference: the factors of friction are held there where no range is given
@@ -83,7 +87,7 @@ def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
     return constants
 
 
-def _fill_condition(record: Any, friction: Friction, reduction_ratio: float) -> None:
+def _fill_condition(record: FrictionConstants, friction: Friction, reduction_ratio: float) -> None:
     load, warm, angle = friction.load, friction.temperature, friction.angle
     if load is not None:
         record.load_coulomb, record.load_viscous_spr = load.coulomb, load.viscous_spr
@@ -97,7 +101,7 @@ def _fill_condition(record: Any, friction: Friction, reduction_ratio: float) -> 
     record.conditioned = int(any((record.load_coulomb, record.load_viscous_spr, *warming, record.of_angle.count)))
 
 
-def fill_series(series: Any, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
+def fill_series(series: HarmonicSeries, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
     """A `HarmonicSeries`; `waves`: amplitudes, periods a motor turn, phases [rad]."""
     series.count = len(waves[0])
     for i, (amplitude, per_motor_turn, phase_rad) in enumerate(zip(*waves, strict=True)):

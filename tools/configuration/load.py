@@ -81,7 +81,7 @@ def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
 def load_config(path: str | Path) -> Config:
     """Read, check and freeze a configuration; `ConfigurationError` holds one line per problem.
 
-    What only the virtual joint can judge of [virtual] is judged where it is made (`plant_settings`).
+    What only the virtual joint can judge of [virtual] is judged where it is made (`tools.virtual_joint`).
     """
     return config_of(Path(path), *read_document(Path(path)))
 

@@ -13,6 +13,7 @@ from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.motion_records import ChangeConstants, Gains, TrajectoryConstants
+from jointctl.firmware_py.observers import low_pass_gain, set_kalman_gains
 from jointctl.firmware_py.records import (
     FED_HISTORY,
     NEURONS,
@@ -36,10 +37,8 @@ from jointctl.firmware_py.states import (
     ZeroSpeedRule,
 )
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
-from jointctl.firmware_py.velocity import low_pass_gain, set_kalman_gains
 from jointctl.tools.configuration.checks import extremes_problems
-from jointctl.tools.configuration.config import Config, raise_if
-from jointctl.tools.configuration.control_section import Adaptation, Control
+from jointctl.tools.configuration.config import Adaptation, Config, Control, raise_if
 from jointctl.tools.configuration.conversions import (
     fill_series,
     friction_constants,

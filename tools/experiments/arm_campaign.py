@@ -42,7 +42,6 @@ from jointctl.tools.analysis.arm_check import pose_models
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config, first_on_bus
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     LATE_CAUSES,
@@ -74,6 +73,7 @@ from jointctl.tools.experiments.judge import (
     wrong_of_joint,
 )
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
+from jointctl.tools.virtual_joint import arm_plant_of
 
 # --- the scenario ---
 
@@ -213,7 +213,7 @@ def masses_of(arm: ArmConfig) -> Masses:
     return Masses(np.abs(np.linalg.inv(inertias)).max(axis=0) / low, throw, np.abs(gravity).max(axis=0) * high)
 
 
-def envelopes(joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: Any) -> list[Envelope]:
+def envelopes(joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: np.recarray) -> list[Envelope]:
     """Of each joint, see the module."""
     arm, fault = joints.arm, scenario.fault
     pushes = masses.gravity_Nm + [sum(joint.plant["torque_ripple_Nm"]) for joint in scenario.joints]
@@ -256,7 +256,9 @@ def _drive_Nm(config: Config) -> float:
     return share * (section.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
 
 
-def _misread(config: Config, scenario: ArmScenario, constants: Any, axis: int, way: float) -> tuple[float, float]:
+def _misread(
+    config: Config, scenario: ArmScenario, constants: np.recarray, axis: int, way: float
+) -> tuple[float, float]:
     """What a wrong reading adds to the joint that has it: (rad, rad/s)."""
     fault = scenario.fault
     if axis != scenario.faulty:
@@ -277,7 +279,7 @@ def _misread(config: Config, scenario: ArmScenario, constants: Any, axis: int, w
     return 0.0, 0.0
 
 
-def _envelope(config: Config, constants: Any, way: float, speed: float, stop_s: float) -> Envelope:
+def _envelope(config: Config, constants: np.recarray, way: float, speed: float, stop_s: float) -> Envelope:
     limits, sequence = constants.limits, config.sequence
     return Envelope(
         position_min_rad=limits.position_min_rad - way,

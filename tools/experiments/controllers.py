@@ -19,8 +19,7 @@ from jointctl.tools.analysis.flexible_gains import chosen_gains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Control
+from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table

@@ -24,22 +24,22 @@ from typing import Any, Literal
 import numpy as np
 
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import reference_at
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
+from jointctl.tools.virtual_joint import plant_settings
 
 During = Literal["run", "sweep", "program", "tune"]
 
@@ -273,7 +273,7 @@ class TuneStep:
 
 
 PlaceStep = Callable[[Config, LockstepJoint, TuneStep, float], PlacedSweep]
-"""The motion of a step for a joint that stands so far from its first point; `tuning.campaign_steps` has it."""
+"""The motion of a step for a joint that stands so far from its first point; `verbs.fault_campaign` has it."""
 
 
 def draw_step(random: np.random.Generator) -> TuneStep | None:

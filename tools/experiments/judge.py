@@ -38,7 +38,7 @@ import numpy as np
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.records import AxisConstants
+from jointctl.firmware_py.records import AxisConstants, LimitConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
@@ -468,7 +468,7 @@ def wrong_of_joint(
     return [*_commands(run, allowed, by_position=by_position), *_motion(run, allowed), *ending, *again], off_s
 
 
-def beyond_rad(run: LockstepRun, limits: Any) -> float:
+def beyond_rad(run: LockstepRun, limits: LimitConstants) -> float:
     """How far the joint truly got beyond its position limits."""
     position = run.truth[:, TRUE_POSITION_rad]
     return float(max(position.max() - limits.position_max_rad, limits.position_min_rad - position.min(), 0.0))

@@ -17,13 +17,16 @@ from jointctl.tools.identification.fit import (
     MAX_OUTLIERS,
     Fit,
     Problem,
+    Uncertainty,
     choose,
     find_outliers,
     held_out_rss,
     make_problem,
     noise_exponent,
+    noise_of,
     polish,
     project,
+    uncertainty,
     with_form,
     with_noise,
 )
@@ -32,7 +35,6 @@ from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, F
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
 from jointctl.tools.identification.swarm import SwarmResult, SwarmSettings, run_swarms
-from jointctl.tools.identification.uncertainty import Uncertainty, noise_of, uncertainty
 
 # --- the flags of `jointctl identify`, and what of them is allowed ---
 

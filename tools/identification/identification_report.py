@@ -14,10 +14,10 @@ from rich.text import Text
 
 from jointctl.firmware_py.friction import DEGREE
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
+from jointctl.tools.identification.fit import NAMES
 from jointctl.tools.identification.friction_data import FrictionData, relative_errors, relative_figures
 from jointctl.tools.identification.identification import DIRECTIONS, Identification
 from jointctl.tools.identification.models import FORMS, Branch
-from jointctl.tools.identification.uncertainty import NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

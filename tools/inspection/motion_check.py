@@ -262,9 +262,9 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     return np.convolve(values, np.ones(cycles) / cycles, "valid")
 
 
-def motion_of(records: Any, threshold_rad: float) -> Motion | None:
+def motion_of(records: np.recarray, threshold_rad: float) -> Motion | None:
     """None if the drive was never enabled."""
-    rows = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
+    rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
     if powered.sum() < 2:
         return None
@@ -294,7 +294,7 @@ def motion_of(records: Any, threshold_rad: float) -> Motion | None:
 
 
 def motion_findings(
-    config: Config, plan: CheckPlan, records: Any, fault: Fault, text: FaultText | None
+    config: Config, plan: CheckPlan, records: np.recarray, fault: Fault, text: FaultText | None
 ) -> Iterator[Finding]:
     """Every finding of one check; `config` is the user's own."""
     second = config.joint_encoder
@@ -330,7 +330,7 @@ def motion_findings(
         yield ended_finding(records, fault, text)
 
 
-def ended_finding(records: Any, fault: Fault, text: FaultText | None) -> Finding:
+def ended_finding(records: np.recarray, fault: Fault, text: FaultText | None) -> Finding:
     """The fault that ended the check."""
     moved = np.isin(records.phase, _POWERED).any()
     when = "while the joint moved" if moved else "before the drive was enabled"

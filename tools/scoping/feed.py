@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.recording.ros_messages import JOINT_NAMES, StateCycles
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
+
+if TYPE_CHECKING:
+    from jointctl.tools.scoping.remote import RemoteOrder
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message; of records the second is the joint's number
 REQUESTS = 16  # of viewers, at most between two looks
@@ -141,7 +144,7 @@ class ScopeFeed:
         else:
             self._send_records(snapshot.axis, snapshot.records)
 
-    def _send_records(self, axis: int, records: Any) -> None:
+    def _send_records(self, axis: int, records: np.ndarray) -> None:
         for at in range(0, len(records), PIECE):
             self.send(RECORDS, bytes([axis]) + records[at : at + PIECE].tobytes())
 
@@ -268,7 +271,7 @@ def scope_server(
 
 @contextmanager
 def server_process(
-    module: str, order: Any, theirs: Sequence[socket.socket], ours: Sequence[socket.socket]
+    module: str, order: ScopeOrder | RemoteOrder, theirs: Sequence[socket.socket], ours: Sequence[socket.socket]
 ) -> Iterator[None]:
     """A process that serves a run: it gets `order`, a dataclass, on its standard input, and one end of each pair.
 

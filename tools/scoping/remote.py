@@ -35,8 +35,8 @@ from jointctl.tools.scoping.remote_options import (
     check_remote,
     foxglove_place,
 )
-from jointctl.tools.session.consent import Consent
 from jointctl.tools.session.display import LONGEST_BYTES, Display, Displays, decoded
+from jointctl.tools.session.plan import Consent
 from jointctl.tools.session.result import run_title
 from jointctl.tools.session.set_points import RemoteSetPoint, SetPointSources
 

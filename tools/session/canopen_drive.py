@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class CanopenSession(SessionDrive):
     def in_fault(self, status_word: int) -> bool:
         return state_of_word(status_word) in _BAD
 
-    def bits_sent(self, ports: Any, axis: int = 0) -> float:
+    def bits_sent(self, ports: np.recarray, axis: int = 0) -> float:
         """Each drive's exchange counts what it sends itself, SYNC, and everything that it receives."""
         first, *others = ports[ports.bus == ports[axis].bus]
         of_others = sum(int(port.cycle) * worst_frame_bits(int(port.rpdo_length)) for port in others)

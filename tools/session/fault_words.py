@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from jointctl.drivers.canopen.cia402 import state_text
-from jointctl.firmware_py.records import ENCODER_RESTARTED
+from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event
 
@@ -321,7 +320,7 @@ LEAST_CYCLES = 3
 SHARE_OF_AGE = 0.5  # of the time without a sample that a pause must have taken to be its cause
 
 
-def longest_pause_s(records: Any, period_s: float) -> float:
+def longest_pause_s(records: np.recarray, period_s: float) -> float:
     """Longest pause of the loop up to the first record with a fault [s]: slots left out, or a cycle that took longer.
 
     `records`: array of LogRecord, shape (N,), the cycles before the fault among them.
@@ -336,7 +335,7 @@ def longest_pause_s(records: Any, period_s: float) -> float:
     return float(max(1e-9 * taken_ns.max(), period_s * near["skipped"].max()))
 
 
-def held_up_text(fault: Fault, value: float, text: FaultText, records: Any, rate_Hz: float) -> FaultText:
+def held_up_text(fault: Fault, value: float, text: FaultText, records: np.recarray, rate_Hz: float) -> FaultText:
     """`text`, with the pause that came before the fault, if there was one that can have caused it."""
     if not FAULT_TEXTS[fault].follows_pause:
         return text
@@ -355,8 +354,8 @@ def held_up_text(fault: Fault, value: float, text: FaultText, records: Any, rate
 # --- What the loop reports without ending the run, in words: torque noise, learning that was switched off ---
 
 
-def notice_text(notice: Notice, state: Any) -> str:
-    """One line, with the numbers of `state`, an `AxisState`, and what to do about it."""
+def notice_text(notice: Notice, state: AxisState) -> str:
+    """One line, with the numbers of `state` and what to do about it."""
     if notice is Notice.TORQUE_NOISE:
         return (
             f"torque noise: the command changes by {float(state.swing.noise_told_Nm):.1f} Nm from cycle to cycle; "
@@ -376,8 +375,8 @@ class NoticeFinder:
     def __init__(self) -> None:
         self._known = 0
 
-    def take(self, state: Any, time_ns: int) -> list[Event]:
-        """Events for what is new in `state`, an `AxisState` that the loop goes on writing to."""
+    def take(self, state: AxisState, time_ns: int) -> list[Event]:
+        """Events for what is new in `state`, which the loop goes on writing to."""
         notices = int(state.notices)
         new = [notice for notice in Notice if notices & ~self._known & notice]
         self._known |= notices

@@ -29,6 +29,7 @@ from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Section, Trajectory
 from jointctl.tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
 from jointctl.tools.session.display import Display, PreparedMotion, ViewerRequest
+from jointctl.tools.session.loop_memory import SharedBlock
 
 # --- Gains: the same gate as before enabling, on the whole way from the old ones to the new ---
 
@@ -109,7 +110,7 @@ def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> 
     return constants, checked_motion(config, record, table)
 
 
-def checked_motion(config: Config, record: Any, table: np.ndarray) -> str:
+def checked_motion(config: Config, record: TrajectoryConstants, table: np.ndarray) -> str:
     """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
     peak = peak_of(record, table)
     problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
@@ -137,12 +138,12 @@ def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
         raise ConfigurationError(problem_line(error.errors(include_url=False)[0], data, ())) from None
 
 
-def motion_in_words(record: Any, speed_radps: float) -> str:
+def motion_in_words(record: TrajectoryConstants, speed_radps: float) -> str:
     """`sine -0.350 .. +0.350 rad, up to 0.22 rad/s`; without a duration `, until stopped`."""
     return _what(record, speed_radps) + ("" if record.duration_s > 0.0 else ", until stopped")
 
 
-def _what(record: Any, speed_radps: float) -> str:
+def _what(record: TrajectoryConstants, speed_radps: float) -> str:
     kind = TrajectoryKind(int(record.kind))
     if kind is TrajectoryKind.HOLD:
         return f"set-point {record.start_rad:+.4f} rad"
@@ -175,7 +176,7 @@ _WHY = {
 }
 
 
-def post_change(box: Any, kind: ChangeKind, payload: Any, move_s: float = 0.0) -> int:
+def post_change(box: np.recarray, kind: ChangeKind, payload: Any, move_s: float = 0.0) -> int:
     """Into the letter box of `ChangeConstants`, the request first, its number last; the loop has answered the others.
 
     `payload`: gains as a mapping, or a record array of one `TrajectoryConstants`; `move_s`: that the way to its
@@ -212,7 +213,7 @@ class LiveChanges:
     def __init__(
         self,
         config: Config,
-        block: Any,
+        block: SharedBlock,
         tell: Callable[[int, str], None],
         delay_s: Callable[[], float | None],
         *,
@@ -431,7 +432,7 @@ class ViewerOrders:
             how += f", incomplete: {error.strerror or error}"
         self._tell(INFO, f"recording {recording.path.name} ended {how}")
 
-    def keep(self, records: Any) -> None:
+    def keep(self, records: np.recarray) -> None:
         """New records, as they go into the run log; a recording that cannot be written does not end the run."""
         if self._recording is None:
             return

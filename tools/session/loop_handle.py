@@ -109,7 +109,9 @@ class LoopHandle:
         part.block = self.block.of_axis(axis)
         return part
 
-    def wait_ready(self, alive: Any = lambda: None, tell: Callable[[str], None] = lambda _: None) -> None:
+    def wait_ready(
+        self, alive: Callable[[], object] = lambda: None, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
         """Until the loop is compiled and warm; `alive` is called all the time and may raise; `tell` gets what it does.
 
         Raises `JointctlError` if it ends, or hangs, before that.
@@ -124,7 +126,7 @@ class LoopHandle:
         """What the bus says from now on is for the run: call it when commissioning and its proofs are over."""
         self.block.words[Word.LISTEN] = 1
 
-    def go(self, constants: Any, port: Any) -> None:
+    def go(self, constants: np.recarray, port: np.recarray) -> None:
         """Hand over the constants and the driver's memory, and let the loop begin."""
         self.block.constants[:] = constants
         self.block.port[:] = port

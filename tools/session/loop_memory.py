@@ -113,7 +113,7 @@ class SharedBlock:
         return records[late:], lost + late
 
 
-def new_block(table: Any, port: type, arm: ArmModel | None) -> SharedBlock:
+def new_block(table: np.ndarray, port: type, arm: ArmModel | None) -> SharedBlock:
     """With the motion's table (rows, 5), of an arm (axes, rows, 5) with its model."""
     tables = np.reshape(table, (-1, *np.shape(table)[-2:]))
     axes, rows = tables.shape[:2]

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import can
+import numpy as np
 
 from jointctl.drivers.can import socketcan
 from jointctl.drivers.can.frames import FRAME_STRUCT
@@ -26,6 +27,7 @@ from jointctl.drivers.can.socketcan import error_frame_text, link_problem, link_
 from jointctl.drivers.drive import SettingsGuard, Thermometer
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.firmware_py.cycle import Histogram, Word
+from jointctl.firmware_py.records import AxisConstants, LawConstants
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import cascade_text, require_margin
 from jointctl.tools.configuration.config import Config
@@ -219,7 +221,7 @@ class TemperatureWatch:
     """`poll` it with the supervisor's other watches; a temperature that cannot be read is no reason to stop."""
 
     def __init__(
-        self, thermometer: Thermometer | None = None, log: RunLogWriter | None = None, law: Any = None
+        self, thermometer: Thermometer | None = None, log: RunLogWriter | None = None, law: LawConstants | None = None
     ) -> None:
         """`law`: the `LawConstants` of the loop, whose friction feed-forward may go with the temperature."""
         self._thermometer, self._log = thermometer, log
@@ -306,7 +308,7 @@ class RunParts:
 class RunWatch:
     """Watches one joint of a run, the only one mostly; `poll` it."""
 
-    def __init__(self, plan: RunPlan, axis: Any, parts: RunParts, joint: JointPlan | None = None) -> None:
+    def __init__(self, plan: RunPlan, axis: AxisConstants, parts: RunParts, joint: JointPlan | None = None) -> None:
         """`axis`: the `AxisConstants` that the loop is about to get; `joint`: of an arm, the one to watch."""
         self.joint = joint = joint or plan.joints[0]
         config = joint.config
@@ -407,7 +409,7 @@ class RunWatch:
         if last:
             self._keep(self._decimated.last())
 
-    def _show(self, records: Any) -> None:
+    def _show(self, records: np.recarray) -> None:
         """New records, shape (N,), to viewers and display, and the events in them."""
         self._orders.keep(records)
         commanded = self.around.signals.commanded_ns != 0  # the drive is off then, and the loop cannot know why
@@ -423,7 +425,7 @@ class RunWatch:
         degC = self.temperature.newest_degC
         self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, drive, records, degC))
 
-    def _keep(self, records: Any) -> None:
+    def _keep(self, records: np.recarray) -> None:
         """Into the log, and kept for the summary at the end."""
         if len(records):
             self.kept.append(records)

@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
+
+import numpy as np
 
 from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
@@ -22,14 +24,13 @@ from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
-from jointctl.tools.recording.run_summary import KeptRecords, TimeSummary, histogram_times, summarise
-from jointctl.tools.session.consent import Consent, prepare_log, require_ready
+from jointctl.tools.recording.run_summary import KeptRecords, histogram_times, summarise
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
-from jointctl.tools.session.plan import Placed, RunPlan, blamed
+from jointctl.tools.session.plan import Consent, Placed, RunPlan, blamed, prepare_log, require_ready
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import (
     Around,
@@ -53,19 +54,7 @@ SYNC_SPREAD_us = 100.0  # of the buses of an arm: what is longer is a warning
 Answer = TypeVar("Answer")
 
 
-def spread_text(spread: TimeSummary | None) -> tuple[int, str, str] | None:
-    """Level, source and text of how far the SYNCs of the buses were apart; None on one bus."""
-    if spread is None:
-        return None
-    level = INFO if spread.max_us <= SYNC_SPREAD_us else WARNING
-    return (
-        level,
-        "bus",
-        f"SYNC of all buses within {spread.p99_us:.0f} us in 99 % of the cycles, {spread.max_us:.0f} us at most",
-    )
-
-
-def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
+def came_before(fault: Fault, records: np.recarray, time_ns: int) -> bool:
     """Whether the loop had latched its fault by then, and not by what `jointctl stop` did to the drive.
 
     Its request is sent first, but a program that is busy may take note of it after the drive has been stopped.
@@ -244,7 +233,7 @@ class Session:
             return self._carry_out(drives, loop, placed.constants, reports, watches)
 
     def _carry_out(
-        self, drives: DriveGroup, loop: LoopHandle, constants: Any, reports: Sequence[CommissioningReport],
+        self, drives: DriveGroup, loop: LoopHandle, constants: np.recarray, reports: Sequence[CommissioningReport],
         watches: Sequence[RunWatch],
     ) -> RunResult:  # fmt: skip
         watch = watches[0]
@@ -302,8 +291,12 @@ class Session:
             if each.around.recorder is not None and each.around.recorder.dropped:
                 dropped = each.around.recorder.dropped
                 each.log.write_event(WARNING, "log", f"{dropped} CAN frames were not recorded: too slow")
-        if (spread := spread_text(histogram_times(loop.block.histograms[Histogram.SYNC_SPREAD]))) is not None:
-            watch.log.write_event(*spread)
+        if (spread := histogram_times(loop.block.histograms[Histogram.SYNC_SPREAD])) is not None:  # several buses
+            watch.log.write_event(
+                INFO if spread.max_us <= SYNC_SPREAD_us else WARNING, "bus",
+                f"SYNC of all buses within {spread.p99_us:.0f} us in 99 % of the cycles, "
+                f"{spread.max_us:.0f} us at most",
+            )  # fmt: skip
         loads = [
             self._kind.bits_sent(loop.block.port, axis) / (joint.config.bus.bitrate_bitps * elapsed_s)
             for axis, joint in enumerate(self._joints)

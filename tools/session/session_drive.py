@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class SessionDrive(ABC):
         """Whether the status word alone tells of a fault."""
         return False
 
-    def bits_sent(self, ports: Any, axis: int = 0) -> float:
+    def bits_sent(self, ports: np.recarray, axis: int = 0) -> float:
         """On the joint's bus or line in this run, `ports` the records of the exchange of all joints."""
         return float(ports[0].bits_sent)
 

@@ -27,11 +27,9 @@ from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED,
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
-from jointctl.tools.session.consent import Consent, TerminalConsent
 from jointctl.tools.session.control import in_control
-from jointctl.tools.session.display import Display, OnlyShows, Snapshot
-from jointctl.tools.session.live_panel import run_display
-from jointctl.tools.session.plan import Motion, Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.session.display import Display, OnlyShows, Snapshot, run_display
+from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
 from jointctl.tools.session.session import Session
 from jointctl.tools.sweeping.meter import SweepMeter

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -184,7 +183,7 @@ class SweepMeter:
         """The point whose window is under way or comes next; None after the last."""
         return self._windows[self._next].point if self._next < len(self._windows) else None
 
-    def feed(self, records: Any) -> None:
+    def feed(self, records: np.recarray) -> None:
         """Log records (recarray); only those of the motion itself with a fresh sample count."""
         use = (records.phase == AxisPhase.TRACKING) & (records.sample_age_cycles == 0)
         if not np.any(use):

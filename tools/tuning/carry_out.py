@@ -6,12 +6,15 @@ simulated time as well.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import MotionFault, UsageError
+from jointctl.drivers.errors import DataError, MotionFault, UsageError
 from jointctl.firmware_py.states import Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.margin_gate import require_margin
@@ -20,14 +23,27 @@ from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.session.consent import TerminalConsent
 from jointctl.tools.session.control import Control
-from jointctl.tools.session.display import Display
+from jointctl.tools.session.display import Display, run_display
 from jointctl.tools.session.fault_words import FaultText, fault_text
-from jointctl.tools.session.live_panel import run_display
-from jointctl.tools.session.plan import Motion, RunPlan
+from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
+from jointctl.tools.tuning.excitation import (
+    LEAST_SHARE,
+    Multisine,
+    ResponseMotion,
+    ResponsePlan,
+    config_of_response,
+    largest_peak_Nm,
+    legs_of,
+    multisine,
+    speed_and_period,
+)
+from jointctl.tools.tuning.found_values import Found, rounded, with_values
+from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, FrequencyResponse, grown, response_of
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
+from jointctl.tools.tuning.tune_options import ResponseOptions
 
 
 class NotCarriedOut(Exception):
@@ -116,3 +132,120 @@ class ShownConsent(TerminalConsent):
     def show(self, lines: Sequence[str]) -> None:
         for line in lines:
             self._output.note(f"  {line}") if self._given else self._output.fact(line)
+
+
+# --- The frequency response: short stages that begin small and grow, then the whole one ---
+# A stage with more torque follows while the coherence is low and the torque is not yet the largest allowed one.  It
+# ends where the joint answers a greater torque with more than its share, which is what a loop on its way to a limit
+# cycle does; limit cycles themselves, and encoders that disagree, end a run as they end every other one.
+#
+# The joint must stay the same: the first half of the legs is compared with the second one, and later steps measure
+# once more what it weighs.
+
+
+LEAST_LEGS, MOST_LEGS = 8, 100
+STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
+GROWTH = 2.0  # of the torque from stage to stage
+ENOUGH_COHERENCE = 0.98  # median over the lines
+RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
+LEAST_CHANGE = 0.1  # of the inertia: a payload; what both intervals allow is none
+
+
+@dataclass(frozen=True)
+class ResponseTask:
+    """What is to be measured, resolved before anything moves; `config` is that of `config_of_response`."""
+
+    config: Config
+    sine: Multisine
+    pairs: int
+    largest_Nm: float
+
+    def motion(self, peak_Nm: float, pairs: int) -> ResponseMotion:
+        plan = ResponsePlan(legs_of(self.config, pairs), self.sine, peak_Nm)
+        return ResponseMotion(self.config, plan, self.largest_Nm)
+
+
+def response_task(config: Config, options: ResponseOptions) -> ResponseTask:
+    """`UsageError` where the options or the limits do not fit."""
+    if not LEAST_LEGS <= options.legs <= MOST_LEGS:
+        raise UsageError(f"--legs (={options.legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
+    moving = config_of_response(config, options.torque_Nm)
+    _, length_s = speed_and_period(moving)
+    return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), options.legs // 2, largest_peak_Nm(moving))
+
+
+def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    """All stages; (response, records, plan) of the last one.  Faults as `Carrier.run` has them."""
+    peak_Nm, before = LEAST_SHARE * task.largest_Nm, None
+    while peak_Nm < task.largest_Nm:
+        found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
+        carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
+        if before is not None:
+            _refuse_growth(before, found)
+        elif found.coherence >= GOOD_COHERENCE:
+            task = _better(task, found)
+        if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
+            break
+        peak_Nm, before = GROWTH * peak_Nm, found
+    found, records, plan = _stage(task, carrier, min(peak_Nm, task.largest_Nm), task.pairs)
+    carrier.output.note(f"  {found.peak_Nm:.2f} Nm: coherence {found.coherence:.3f}, {found.legs} legs")
+    if before is not None:
+        _refuse_growth(before, found)
+    return found, records, plan
+
+
+def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarray, fit: JointFit) -> None:
+    """`MotionFault` where the halves of the legs are of two joints; where too few legs are left nothing is compared."""
+    parts = [replace(plan, legs=replace(plan.legs, starts=starts)) for starts in np.array_split(plan.legs.starts, 2)]
+    with contextlib.suppress(DataError):
+        first, second = (fitted_again(response_of(task.config, part, records), fit) for part in parts)
+        _refuse_another("the first half of the response", first, "in the second half", second)
+
+
+def require_same_joint(config: Config, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
+    """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
+    task = response_task(config, ResponseOptions())
+    peak_Nm = min(peak_Nm, task.largest_Nm)
+    try:
+        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    except DataError:  # a leg was lost
+        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    _refuse_another("the response", fit.inertia_kgm2, when, inertia)
+    carrier.output.note(f"  the same joint: {inertia.value:.4g} kg m^2 {when}")
+
+
+def _refuse_another(before: str, first: Estimate, after: str, second: Estimate) -> None:
+    change = abs(second.value - first.value)
+    if change > max(LEAST_CHANGE * first.value, first.half + second.half):
+        raise MotionFault(
+            f"the joint is another one: {first.value:.3g} kg m^2 in {before}, {second.value:.3g} {after}",
+            "nothing may be put on the joint or taken off during a tune",
+        )
+
+
+def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
+    """With the inertia that the first stage tells: the weak law of one that is too light is too weak for friction."""
+    try:
+        inertia = fit_joint(found, task.config.joint.inertia_kgm2).inertia_kgm2.value
+    except DataError:
+        return task
+    config = with_values(task.config, [Found(("joint",), "inertia_kgm2", rounded(inertia), "")])
+    return replace(task, config=config)
+
+
+def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
+    factor = grown(before, after)
+    if factor > RESONANCE_GROWTH:
+        raise MotionFault(
+            f"the joint answers {after.peak_Nm:.2g} Nm with {factor:.1f} times its share of what it does at "
+            f"{before.peak_Nm:.2g} Nm: a resonance grows",
+            "less torque: --torque",
+        )
+
+
+def _stage(
+    task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int
+) -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    motion = task.motion(peak_Nm, pairs)
+    carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
+    return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan

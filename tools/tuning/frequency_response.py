@@ -142,7 +142,7 @@ def sides_of(config: Config) -> tuple[str, str | None]:
     return ("motor" if config.encoder.side == "motor" else "link"), "link"
 
 
-def response_of(config: Config, plan: ResponsePlan, records: Any) -> FrequencyResponse:
+def response_of(config: Config, plan: ResponsePlan, records: np.recarray) -> FrequencyResponse:
     """Of the log of a `ResponseMotion`; `config` is that of `config_of_response`.  `DataError` with too few legs."""
     period_s = 1.0 / config.loop.rate_Hz
     rows = records[records.phase == AxisPhase.TRACKING]

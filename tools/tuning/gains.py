@@ -39,8 +39,7 @@ from jointctl.tools.analysis.linear_loop import (
     two_masses,
 )
 from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Control, Learning
+from jointctl.tools.configuration.config import Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.experiments.controllers import from_file, paper_control

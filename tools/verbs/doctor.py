@@ -81,8 +81,8 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
 
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
     """Commission, tell, ask, pull, judge; 0, 1 if something is wrong, 12 if declined, 130 after an interruption."""
-    from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import require_terminal
 
     if not assume_yes:
         require_terminal()
@@ -97,7 +97,7 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
 def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     from jointctl.firmware_py.states import Fault
     from jointctl.tools.inspection.motion_check import check_run, ended_finding, judged, make_plan, motion_findings
-    from jointctl.tools.session.consent import TerminalConsent
+    from jointctl.tools.session.plan import TerminalConsent
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.session.session import Session
 

@@ -53,7 +53,7 @@ def excite(
 ) -> int:
     """Move so that inertia, gravity, friction and its load can be told apart; writes a run log for `identify`."""
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.sweeping.carry_out import config_of_sweep
     from jointctl.tools.sweeping.excitation import ExcitePass, designed, excitation_figure
     from jointctl.tools.sweeping.plan import refuse_constants
@@ -103,7 +103,7 @@ def _measured(config: Config, motion: Motion, output: Output, *, allow_low_margi
 
 
 def _lockstep(config: Config, motion: Motion, output: Output, *, assume_yes: bool, dry_run: bool) -> Path | int:
-    from jointctl.tools.session.consent import TerminalConsent
+    from jointctl.tools.session.plan import TerminalConsent
     from jointctl.tools.sweeping.carry_out import lockstep_log
 
     log = lockstep_log(config, motion, TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,12 +18,44 @@ if TYPE_CHECKING:
 
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
-    from jointctl.tools.experiments.fault_scenarios import During, PlaceStep
+    from jointctl.tools.experiments.fault_scenarios import During, PlacedSweep, PlaceStep, TuneStep
     from jointctl.tools.experiments.judge import Verdict
+    from jointctl.tools.lockstep import LockstepJoint
+    from jointctl.tools.session.plan import Motion
 
 EXIT_VIOLATIONS = 10
 LARGEST = 2**31 - 1  # of a seed or of a scenario's number
 SHOWN = 20
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Which scenarios."""
+
+    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST)] = 1
+    scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)] = None
+
+
+AS_USUAL = Drawn()
+
+
+def _during(
+    *,
+    sweep: Annotated[bool, typer.Option("--sweep", help="during a sweep, in its mode, instead of a run")] = False,
+    program: Annotated[
+        bool, typer.Option("--program", help="while a program sends set-points, which may fail too")
+    ] = False,
+    tune: Annotated[bool, typer.Option("--tune", help="during the steps of a tune, which move the joint")] = False,
+) -> During:
+    asked: tuple[tuple[During, bool], ...] = (("sweep", sweep), ("program", program), ("tune", tune))
+    given = [name for name, on in asked if on]
+    if len(given) > 1:
+        raise UsageError(f"--{given[0]} and --{given[1]} exclude each other")
+    return given[0] if given else "run"
+
+
+BrokenMotion = Annotated["During", _during]
 
 
 def _joint_or_arm(config: ConfigPath = Path("virtual")) -> Config | ArmConfig:
@@ -36,16 +69,8 @@ def fault_campaign(
     config: JointOrArmToBreak,
     output: VerbOutput,
     *,
-    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST)] = 1,
-    scenario: Annotated[
-        int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)
-    ] = None,
-    sweep: Annotated[bool, typer.Option("--sweep", help="during a sweep, in its mode, instead of a run")] = False,
-    program: Annotated[
-        bool, typer.Option("--program", help="while a program sends set-points, which may fail too")
-    ] = False,
-    tune: Annotated[bool, typer.Option("--tune", help="during the steps of a tune, which move the joint")] = False,
+    drawn: Drawn = AS_USUAL,
+    during: BrokenMotion = "run",
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: ManyRuns = None,
     report: Report = None,
@@ -71,11 +96,7 @@ def fault_campaign(
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_folder
 
-    asked: tuple[tuple[During, bool], ...] = (("sweep", sweep), ("program", program), ("tune", tune))
-    given = [name for name, on in asked if on]
-    if len(given) > 1:
-        raise UsageError(f"--{given[0]} and --{given[1]} exclude each other")
-    during: During = given[0] if given else "run"
+    seed = drawn.seed
     if isinstance(config, ArmConfig):
         if during != "run":
             raise UsageError(f"--{during} is one joint's, and {config.path} is an arm", "give the joint's file")
@@ -83,14 +104,14 @@ def fault_campaign(
     else:
         require_simulated(config, "fault-campaign")
         require_fit(config)
-    if scenario is not None:
-        return _replay(config, output, seed, scenario, during)
+    if drawn.scenario is not None:
+        return _replay(config, output, seed, drawn.scenario, during)
     if report is not None:
         check_target(report)
     prepare_folder(folder)
-    with output.progress("fault campaign", float(count)) as advance:
+    with output.progress("fault campaign", float(drawn.count)) as advance:
         verdicts, elapsed_s, interrupted = run_campaign(
-            config, seed, count, advance, workers or HERE, during, place_of(during)
+            config, seed, drawn.count, advance, workers or HERE, during, place_of(during)
         )
     rows = rows_by_kind(verdicts)
     found = violations(config, verdicts, seed, during)
@@ -121,11 +142,38 @@ def fault_campaign(
 
 def place_of(during: During) -> PlaceStep | None:
     """The motions of a tune, which is of another package than the campaign."""
-    if during != "tune":
-        return None
-    from jointctl.tools.tuning.campaign_steps import placed_step
+    return placed_step if during == "tune" else None
 
-    return placed_step
+
+def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad: float) -> PlacedSweep:
+    """`step` of a tune of the joint, which stands at `start_rad`: a scenario of `--tune` breaks it.
+
+    The law, the limits and the table are those of the step itself; a response has one pair of legs, a friction step few
+    plateaus.  Where the joint stands is drawn: a step begins from anywhere.
+    """
+    from jointctl.tools.configuration.conversions import static_friction_Nm
+    from jointctl.tools.experiments.fault_scenarios import PlacedSweep, placed_sweep
+    from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan
+    from jointctl.tools.tuning.carry_out import response_task
+    from jointctl.tools.tuning.excitation import motor_fed
+    from jointctl.tools.tuning.found_values import with_break_away
+    from jointctl.tools.tuning.tune_options import AS_IT_FITS
+
+    # what the step of the direction finds, on this joint
+    unknown = with_break_away(config, static_friction_Nm(config) or 0.0)
+    motion: Motion
+    if step.name == "friction":
+        return placed_sweep(unknown, joint, step.strokes, start_rad)
+    if step.name == "direction":
+        moving = motor_fed(config)
+        plan = make_plan(moving, None)
+        motion = CheckMotion(config_of_check(moving, plan), plan)
+    else:
+        task = response_task(unknown, AS_IT_FITS)
+        motion = task.motion(step.share * task.largest_Nm, 1)
+    placed = motion.placed(replace(joint.report, start_position_rad=start_rad))
+    duration_s = float(placed.constants[0].trajectory.duration_s)
+    return PlacedSweep(placed.constants, placed.table, start_rad, duration_s)
 
 
 def _write_page(

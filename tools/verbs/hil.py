@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,8 @@ from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.session.control import StopSignals
@@ -125,7 +127,7 @@ def serve_can(
 
 
 @contextlib.contextmanager
-def watched(config: Config | ArmConfig, live: ObserveOptions, output: Output, plants: Any) -> Iterator[None]:
+def watched(config: Config | ArmConfig, live: ObserveOptions, output: Output, plants: np.recarray) -> Iterator[None]:
     """With Foxglove and ROS 2 looking on: the joint states of the plants, a record array of `PlantState`."""
     from jointctl.firmware_py.records import LogRecord
     from jointctl.firmware_py.schema import new

@@ -15,6 +15,8 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
     from jointctl.tools.configuration.config import Config
 
@@ -71,7 +73,7 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     return torque.model_copy(update={"trajectory": motion})
 
 
-def map_run(config: Config, records: Any, late_s: float) -> MapRun:
+def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:
     """What the log of such a motion says; `late_s`: from a command to its torque."""
     from jointctl.tools.analysis.reducer_map import MapRun, late_torque_Nm, tracked
 
@@ -125,7 +127,7 @@ def map_verb(
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.configuration.written_sections import with_map, write_changed
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.plan import require_terminal
 
     if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
         raise ConfigurationError(

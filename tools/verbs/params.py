@@ -121,8 +121,8 @@ def restore_file(
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.inspection.parameters import load_parameters, restore
     from jointctl.tools.inspection.subject import SdoReader, canopen_network
-    from jointctl.tools.session.consent import agreed, require_terminal
     from jointctl.tools.session.control import control_of
+    from jointctl.tools.session.plan import agreed, require_terminal
 
     node, objects = subject.required_node(), _known_objects(subject)
     wanted = load_parameters(path, node)

@@ -50,13 +50,12 @@ def response(
     import contextlib
 
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import TerminalConsent, require_terminal
     from jointctl.tools.session.result import never_begun, require_off
-    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
+    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, measured_response, response_task
     from jointctl.tools.tuning.frequency_response import bode_figure
     from jointctl.tools.tuning.joint_fit import fit_joint
-    from jointctl.tools.tuning.measured_response import measured_response, response_task
     from jointctl.tools.written_file import replace_file, require_target
 
     picture, file = figure or Path(f"{config.path.stem}.response.png"), out or Path(f"{config.path.stem}.response.json")

@@ -64,9 +64,8 @@ def tracked(
 ) -> int:
     """`run` from Python; `own`: the virtual joint that was started for it, and may still be starting."""
     from jointctl.tools.scoping.remote import remote
-    from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import configured, free, resolve_any
+    from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
     from jointctl.tools.session.set_points import load_check
@@ -102,8 +101,7 @@ def _displays(
 ) -> Iterator[Callable[[CommissioningReport], Display]]:
     """What shows the run: the terminal, and the page if one is wanted."""
     from jointctl.tools.recording.ros_messages import JOINT_NAMES
-    from jointctl.tools.session.display import Displays
-    from jointctl.tools.session.live_panel import run_display
+    from jointctl.tools.session.display import Displays, run_display
 
     terminal = run_display(output, title)
     if scope is None:

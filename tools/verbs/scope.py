@@ -119,8 +119,7 @@ class _Runs:
     def one(self) -> bool:
         """Prepare, wait for Start, run, report; whether a signal has ended the program as well."""
         from jointctl.tools.session.control import in_control
-        from jointctl.tools.session.display import Displays
-        from jointctl.tools.session.live_panel import run_display
+        from jointctl.tools.session.display import Displays, run_display
         from jointctl.tools.session.plan import resolve
         from jointctl.tools.session.result import report_run, words
         from jointctl.tools.session.session import Session

@@ -20,8 +20,8 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     """Stop and disable the drive now, or all those of an arm, also while another program controls them."""
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
+    from jointctl.drivers.bus_lock import StopCall
     from jointctl.drivers.drive import common_state
-    from jointctl.tools.session.stop_call import StopCall
     from jointctl.tools.verbs.bench_drive import stop_targets
 
     path = config_path(config)

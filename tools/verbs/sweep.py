@@ -68,7 +68,7 @@ class Sweep:
     def __init__(
         self, config: Config, output: Output, out: Path, options: SweepOptions, others: Remote | None = None
     ) -> None:
-        from jointctl.tools.session.consent import TerminalConsent
+        from jointctl.tools.session.plan import TerminalConsent
         from jointctl.tools.sweeping.carry_out import config_of_sweep
         from jointctl.tools.sweeping.plan import make_plan, refuse_constants
 
@@ -123,7 +123,7 @@ class Sweep:
 
     def _under(self, condition: Condition, points: list[SweepPoint]) -> str | None:
         """Measure under one load, at one place, and once more what did not settle; as `_measure`."""
-        from jointctl.tools.session.consent import agreed
+        from jointctl.tools.session.plan import agreed
 
         again = [p for p in self._to_revisit() if p.condition == condition]
         if not (points or again):
@@ -311,8 +311,8 @@ def sweep(
     """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session import result as drive_end
-    from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import require_terminal
 
     if options.lockstep and live != NOBODY:
         raise UsageError("--lockstep is simulated time: nothing of it can be watched with --foxglove or --ros2")

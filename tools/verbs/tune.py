@@ -32,8 +32,8 @@ def tune(
     leaves the file as it was.
     """
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
-    from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, ShownConsent
     from jointctl.tools.verbs.tune_steps import Tune

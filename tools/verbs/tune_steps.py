@@ -22,8 +22,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Control
+from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
@@ -37,7 +36,14 @@ from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check,
 from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
-from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
+from jointctl.tools.tuning.carry_out import (
+    Carrier,
+    NotCarriedOut,
+    measured_response,
+    require_one_joint,
+    require_same_joint,
+    response_task,
+)
 from jointctl.tools.tuning.excitation import motor_fed
 from jointctl.tools.tuning.found_values import (
     Found,
@@ -52,12 +58,6 @@ from jointctl.tools.tuning.found_values import (
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, from_dict
 from jointctl.tools.tuning.gains import ChosenGains, choose_gains
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
-from jointctl.tools.tuning.measured_response import (
-    measured_response,
-    require_one_joint,
-    require_same_joint,
-    response_task,
-)
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
 from jointctl.tools.verbs.sweep import Sweep

@@ -52,7 +52,7 @@ def zero(
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.configuration.load import load_config, read_text
     from jointctl.tools.inspection.first_values import filled
-    from jointctl.tools.session.consent import agreed, require_terminal
+    from jointctl.tools.session.plan import agreed, require_terminal
     from jointctl.tools.written_file import replace_file
 
     if config.path.resolve().is_relative_to(SHIPPED_FOLDER):

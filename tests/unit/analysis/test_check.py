@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import CONTROLLERS, loop_settings
 from jointctl.tools.analysis.loop_report import not_modelled
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm, require_margin
@@ -372,7 +372,7 @@ def test_a_remedy_does_for_every_joint() -> None:
 
 def test_learning_is_judged_with_the_worst_joint() -> None:
     from jointctl.tools.analysis.margin_gate import learning_of
-    from jointctl.tools.configuration.control_section import Learning
+    from jointctl.tools.configuration.config import Learning
 
     good = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
     for learning, converges in ((good, True), (good.model_copy(update={"error_gain_ps2": 60000.0}), False)):

@@ -15,11 +15,11 @@ from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.records import LawConstants, LawState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, Encoders, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, step_plant
 from jointctl.tools.analysis.flexible_gains import LARGEST_S_ANYWHERE, LARGEST_NOISE_Nm, chosen_gains
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop, loop_settings

@@ -14,11 +14,11 @@ from scipy.linalg import expm
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import low_pass_gain, set_kalman_gains, step_velocity
 from jointctl.firmware_py.records import LawConstants, LawState, VelocityConstants, VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.firmware_py.velocity import low_pass_gain, set_kalman_gains, step_velocity
 from jointctl.hil.plant import plant, step_plant
 from jointctl.hil.plant_records import DELAY_SLOTS
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, sampled_joint

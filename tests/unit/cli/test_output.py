@@ -27,7 +27,7 @@ from jointctl.tools.recording.report_page import Details, Paragraph, Section, dr
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.recording.run_log import INFO, Event
 from jointctl.tools.scoping.history import History
-from jointctl.tools.session.live_panel import LivePanel
+from jointctl.tools.session.display import LivePanel
 from jointctl.tools.verbs import study as study_module
 from jointctl.tools.verbs.info import info_table
 from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target

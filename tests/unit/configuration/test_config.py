@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from docs.reference import models_in, rows_of, sections_of_drives
 from jointctl.drivers.elmo.codes import motor_fault_text
 from jointctl.drivers.errors import ConfigurationError, MarginError
 from jointctl.firmware_py.states import Fault
@@ -20,7 +21,6 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.elmo import elmo_section, serial_line_share
 from jointctl.tools.configuration.load import load_config, moved, shipped_config
-from jointctl.tools.configuration.reference import models_in, rows_of, sections_of_drives
 from jointctl.tools.output import Output
 from jointctl.tools.session.elmo_drive import SERIAL_TEXTS
 from jointctl.tools.session.session_drive import session_drive

@@ -15,11 +15,11 @@ from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py import friction as friction_model
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
-from jointctl.firmware_py.velocity import step_velocity
 from jointctl.tools.configuration.canopen import CanopenSection
 from jointctl.tools.configuration.checks import trajectory_extremes
 from jointctl.tools.configuration.conversions import (
@@ -30,9 +30,9 @@ from jointctl.tools.configuration.conversions import (
 )
 from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import approach_s, trajectory_table
 from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
 

@@ -25,6 +25,7 @@ from jointctl.drivers.bus_lock import (
     STOP_WITHIN_S,
     BusLock,
     Holder,
+    StopCall,
     is_marked,
     lock_holders,
     lock_name,
@@ -34,8 +35,6 @@ from jointctl.drivers.bus_lock import (
 )  # fmt: skip
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
-from jointctl.tools.session import stop_call
-from jointctl.tools.session.stop_call import StopCall
 
 
 @pytest.fixture
@@ -235,8 +234,8 @@ def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, name: str, 
 
 
 def test_a_program_that_starts_for_too_long_is_named(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_call, "STARTING_S", 0.6)
-    monkeypatch.setattr(stop_call, "NOTED_S", 0.2)
+    monkeypatch.setattr(bus_lock, "STARTING_S", 0.6)
+    monkeypatch.setattr(bus_lock, "NOTED_S", 0.2)
     slow = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(60.0)\n"
     notes: list[str] = []
     with controller(channel, slow) as process, StopCall("socketcan", channel) as call:

@@ -13,16 +13,15 @@ from jointctl.firmware_py.flexible_joint import Reading, motor_and_link_errors, 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, DriveState, Encoders, Fault, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, spring_torque_Nm, step_plant
 from jointctl.tools import lockstep
 from jointctl.tools.configuration.canopen import canopen_settings
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.control_section import Learning
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import changed, shipped, written

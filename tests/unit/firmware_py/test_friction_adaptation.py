@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.friction import paper_friction, step_lugre
-from jointctl.firmware_py.friction_adaptation import (
+from jointctl.firmware_py.friction import (
     AS_CONFIGURED,
     MOST,
     SINES,
@@ -19,7 +18,9 @@ from jointctl.firmware_py.friction_adaptation import (
     adapt,
     adapted_feed_forward_Nm,
     fed_before_Nm,
+    paper_friction,
     reset_adaptation,
+    step_lugre,
     take_at_rest,
 )
 from jointctl.firmware_py.records import BRISTLES, AdaptationState, LawConstants, LuGreConstants

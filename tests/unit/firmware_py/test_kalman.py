@@ -11,9 +11,9 @@ from scipy.linalg import solve_discrete_are
 
 from jointctl.firmware_py.live_change import gains_of, set_gains
 from jointctl.firmware_py.motion_records import ChangeConstants, Gains
+from jointctl.firmware_py.observers import kalman_gains, low_pass_gain, set_kalman_gains, step_kalman
 from jointctl.firmware_py.records import LawState, ObserverConstants, ObserverState
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.velocity import kalman_gains, low_pass_gain, set_kalman_gains, step_kalman
 from jointctl.tools.configuration.records import axis_constants
 from tests.configurations import shipped
 

@@ -9,12 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.disturbance_observer import (
-    PAIRED_FROM_radps,
-    add_to_disturbance,
-    reset_observer,
-    step_observer,
-)
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
@@ -34,6 +28,14 @@ from jointctl.firmware_py.law import (
     watch_learning,
 )
 from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.observers import (
+    PAIRED_FROM_radps,
+    add_to_disturbance,
+    low_pass_gain,
+    reset_observer,
+    step_observer,
+    step_velocity,
+)
 from jointctl.firmware_py.records import (
     NEURONS,
     LawState,
@@ -49,7 +51,6 @@ from jointctl.firmware_py.records import (
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, ZeroSpeedRule
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
 
 # --- Velocity from position differences ---
 PERIOD_s = 1e-3

@@ -15,8 +15,8 @@ from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
-from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
+from jointctl.tools.virtual_joint import arm_plant_of
 from tests.bench.arm_study import KINDS, SPEEDS, random_arm, rmse_mrad
 from tests.bench.arm_study import run as run_study
 

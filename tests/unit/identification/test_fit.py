@@ -19,9 +19,11 @@ from jointctl.tools.identification.fit import (
     knee_candidates,
     make_problem,
     noise_exponent,
+    noise_of,
     polish,
     project,
     solve_linear,
+    uncertainty,
     vector_limits,
     with_noise,
 )
@@ -38,7 +40,6 @@ from jointctl.tools.identification.swarm import (
     stream_seed,
     suffix_sums,
 )
-from jointctl.tools.identification.uncertainty import noise_of, uncertainty
 from tests.unit.identification.synthetic_friction import DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
 
 # --- Models, variable projection, particle swarm, polish: on data of Table 3 they reach what can be reached ---

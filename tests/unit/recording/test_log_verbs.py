@@ -37,8 +37,8 @@ from jointctl.tools.recording.run_log import (
     require_room,
 )
 from jointctl.tools.recording.run_log_reader import FORMATS, columns, missing_records, parquet_bytes, read_run_log
-from jointctl.tools.session.consent import prepare_log, require_ready
 from jointctl.tools.session.display import EventFinder
+from jointctl.tools.session.plan import prepare_log, require_ready
 from jointctl.tools.session.run_watch import FrameRecorder, recording
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs.log import log_export, log_info, log_plot

@@ -34,9 +34,8 @@ from jointctl.tools.scoping.history import EVENTS, POINTS, SIGNALS, History, cro
 from jointctl.tools.scoping.server import COOKIE, allowed, cookie_name
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
-from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest
+from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest, time_left
 from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, new_motion
-from jointctl.tools.session.live_panel import time_left
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.session.session import Session

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.bus_lock import BusLock, lock_name, wait_for_answers
+from jointctl.drivers import bus_lock
+from jointctl.drivers.bus_lock import BusLock, StopCall, lock_name, wait_for_answers
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.output import Output
-from jointctl.tools.session import control, stop_call
+from jointctl.tools.session import control
 from jointctl.tools.session.control import (
     AGAIN_S,
     FILES_S,
@@ -35,7 +36,6 @@ from jointctl.tools.session.control import (
     stop_within_s,
 )
 from jointctl.tools.session.session import NOTED_WITHIN_NS, came_before
-from jointctl.tools.session.stop_call import StopCall
 
 
 # --- A program's right to a joint: what its stops ask for, and how long it may take to end ---
@@ -252,21 +252,21 @@ class Computer:
     ) -> None:  # fmt: skip
         self.now_s = 0.0
         self.holders = [*holders]
-        self.marks = {stop_call.STARTING: starting or {}, lock_name("socketcan", "x"): marked or {}}
+        self.marks = {bus_lock.STARTING: starting or {}, lock_name("socketcan", "x"): marked or {}}
         self.deaf_to = deaf_to
         self.signals: list[tuple[list[int], str, float]] = []
         self.notes: list[str] = []
         self.ended_s: list[float] = []  # when the drive is switched off once more
         for program in (program for look in holders for program in look):
             program.computer = self
-        monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
-        monkeypatch.setattr(stop_call, "lock_holders", lambda *_: self.holders.pop(0) if self.holders else [])
-        monkeypatch.setattr(stop_call, "wait_for_answers", lambda _: None)
-        monkeypatch.setattr(stop_call, "is_marked", self.is_marked)
+        monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
+        monkeypatch.setattr(bus_lock, "lock_holders", lambda *_: self.holders.pop(0) if self.holders else [])
+        monkeypatch.setattr(bus_lock, "wait_for_answers", lambda _: None)
+        monkeypatch.setattr(bus_lock, "is_marked", self.is_marked)
         monkeypatch.setattr(
-            stop_call, "marked_processes", lambda name: [pid for pid in self.marks[name] if self.is_marked(pid, name)]
+            bus_lock, "marked_processes", lambda name: [pid for pid in self.marks[name] if self.is_marked(pid, name)]
         )
-        monkeypatch.setattr(stop_call, "_signalled", self.signalled)
+        monkeypatch.setattr(bus_lock, "_signalled", self.signalled)
 
     def sleep(self, seconds: float) -> None:
         self.now_s = round(self.now_s + seconds, 6)
@@ -303,7 +303,7 @@ def test_where_no_one_has_the_bus_nothing_is_done(monkeypatch: pytest.MonkeyPatc
         (FOR_EVER, 0.0, 3.0, 3.0, False),
         (FOR_EVER, FOR_EVER, 3.0, 3.0, True),
         (FOR_EVER, FOR_EVER, 0.0, 0.0, True),
-        (FOR_EVER, FOR_EVER, 1000.0, stop_call.LONGEST_S, True),
+        (FOR_EVER, FOR_EVER, 1000.0, bus_lock.LONGEST_S, True),
     ],
 )
 def test_one_that_acknowledges_has_its_own_time(
@@ -353,7 +353,7 @@ def test_a_controller_that_was_asked_is_not_asked_again(monkeypatch: pytest.Monk
     assert computer.notes == ["stopping the program that controls the bus (pid 7)"]
 
 
-@pytest.mark.parametrize(("started_s", "waited_s"), [(0.0, 0.0), (3.0, 3.0), (FOR_EVER, stop_call.STARTING_S)])
+@pytest.mark.parametrize(("started_s", "waited_s"), [(0.0, 0.0), (3.0, 3.0), (FOR_EVER, bus_lock.STARTING_S)])
 def test_one_that_starts_is_waited_for_and_ended_as_well(
     monkeypatch: pytest.MonkeyPatch, started_s: float, waited_s: float
 ) -> None:
@@ -381,20 +381,20 @@ def test_what_is_left_is_ended_by_force(monkeypatch: pytest.MonkeyPatch, deaf_to
     computer = Computer(monkeypatch, [], [], marked={7: FOR_EVER, 9: FOR_EVER}, deaf_to=deaf_to)
     computer.stopped()
     left = [7, 9] if deaf_to else []
-    assert computer.signals[:2] == [([7, 9], "SIGTERM", stop_call.TERM_S), (left, "SIGKILL", stop_call.KILL_S)]
-    assert computer.notes[0] == f"it does not end by itself: ending process 7, 9; {stop_call.ARMED}"
+    assert computer.signals[:2] == [([7, 9], "SIGTERM", bus_lock.TERM_S), (left, "SIGKILL", bus_lock.KILL_S)]
+    assert computer.notes[0] == f"it does not end by itself: ending process 7, 9; {bus_lock.ARMED}"
     cannot = "process 7, 9 cannot be ended; the drive may be enabled again"
     assert (cannot in computer.notes) is (signal.SIGKILL in deaf_to)
 
 
 @pytest.mark.parametrize("marked", [True, False])
 def test_only_what_acts_for_the_controller_gets_the_signal(monkeypatch: pytest.MonkeyPatch, marked: bool) -> None:
-    monkeypatch.setattr(stop_call, "is_marked", lambda pid, name: marked and name == "its name")
-    monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    monkeypatch.setattr(bus_lock, "is_marked", lambda pid, name: marked and name == "its name")
+    monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: 0.0))
     open_before = len(os.listdir("/proc/self/fd"))
     with subprocess.Popen(["sleep", "60"]) as process, subprocess.Popen(["true"]) as gone:
         gone.wait()
-        assert stop_call._signalled([gone.pid, process.pid], "its name", signal.SIGTERM, 0.5) == []
+        assert bus_lock._signalled([gone.pid, process.pid], "its name", signal.SIGTERM, 0.5) == []
         if not marked:
             process.kill()
         assert process.wait() == (-signal.SIGTERM if marked else -signal.SIGKILL)
@@ -402,9 +402,9 @@ def test_only_what_acts_for_the_controller_gets_the_signal(monkeypatch: pytest.M
 
 
 def test_those_that_live_on_after_a_signal_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_call, "is_marked", lambda *_: True)
+    monkeypatch.setattr(bus_lock, "is_marked", lambda *_: True)
     with subprocess.Popen(["sleep", "60"]) as process:
-        assert stop_call._signalled([process.pid], "its name", signal.SIGCONT, 0.01) == [process.pid]
+        assert bus_lock._signalled([process.pid], "its name", signal.SIGCONT, 0.01) == [process.pid]
         process.kill()
 
 

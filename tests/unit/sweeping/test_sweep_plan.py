@@ -21,7 +21,6 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import elmo_section, elmo_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
 from jointctl.tools.sweeping.meter import LEAST_SAMPLES
 from jointctl.tools.sweeping.options import (
@@ -44,6 +43,7 @@ from jointctl.tools.sweeping.plan import (
     stroke_of,
 )
 from jointctl.tools.verbs.sweep import sweep
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, edited
 from tests.sessions import output
 

@@ -12,10 +12,10 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.tuning.found_values import MARK, Found, values_of_fit, with_tuned, with_values
 from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
 
 NAMES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",

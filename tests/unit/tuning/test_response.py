@@ -16,7 +16,6 @@ from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
 from jointctl.tools.configuration.conversions import static_friction_Nm
-from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.tuning.excitation import (
     ResponsePlan,
@@ -31,6 +30,7 @@ from jointctl.tools.tuning.excitation import (
 from jointctl.tools.tuning.found_values import with_break_away, without_friction
 from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
 from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, fitted_again, gravity_of
+from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
 
 T = 1e-3

@@ -1,4 +1,4 @@
-"""docs/configuration.md from the models: `python -m jointctl.tools.configuration.reference [FILE]`.
+"""docs/configuration.md from the models: `python docs/reference.py [FILE]`.
 
 Key, type, range and default are those that pydantic checks with; the meaning is the comment at the key in the source,
 behind it or in lines of their own above it.
@@ -30,7 +30,7 @@ UNITS = {
 TYPES = {float: "number", int: "whole number", str: "text", bool: "true, false"}
 HEAD = """# Configuration reference
 
-Made from the models by `python -m jointctl.tools.configuration.reference docs/configuration.md`; do not edit.
+Made from the models by `python docs/reference.py docs/configuration.md`; do not edit.
 
 A configuration is one TOML file. The unit of a quantity is part of its key; a text with another one (`"30 deg"`,
 `"20 rpm"`, `"1 kHz"`) is understood where it has one meaning, and echoed. A key without a default must be there; one
