@@ -107,9 +107,19 @@ def twist_of(constants: FlexibleConstants, torque_Nm: float) -> tuple[float, flo
 
 @kernel
 def desired_motor(constants: LawConstants, state: LawState, reference: Reference, gravity_slope_Nmprad: float) -> float:
-    """Feed-forward torque [Nm]; leaves theta_d in the state.  Friction and gravity of this cycle are there already."""
-    flexible = constants.flexible
-    speed, acceleration = reference.velocity_radps, reference.acceleration_radps2
+    """Feed-forward torque [Nm] of the motion `feed_forward_lead_s` from now; leaves theta_d of now in the state.
+
+    Friction and gravity of that time are there already.
+    """
+    flexible, lead_s = constants.flexible, constants.feed_forward_lead_s
+    acceleration = reference.acceleration_radps2 + lead_s * (reference.jerk_radps3 + 0.5 * lead_s * reference.snap_radps4)
+    speed = reference.velocity_radps + lead_s * (
+        reference.acceleration_radps2 + 0.5 * lead_s * reference.jerk_radps3
+    )
+    mean_radps = reference.velocity_radps + lead_s * (
+        0.5 * reference.acceleration_radps2 + lead_s / 6.0 * reference.jerk_radps3
+    )
+    link_rad = reference.position_rad + lead_s * mean_radps
     link_friction = flexible.link_friction_share * state.friction_torque_Nm
     through = flexible.link_inertia_kgm2 * acceleration + link_friction + state.gravity_torque_Nm
     bend = flexible.link_inertia_kgm2 * reference.snap_radps4  # the second derivative of that torque
@@ -118,16 +128,37 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
         bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
     twist, compliance = twist_of(flexible, through)
     # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
-    own, ahead = state.flexible, reference.position_rad + twist
-    target = own.target_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
-    error, slope, curvature = series_at(flexible.kinematic_error, target)
+    own, ahead = state.flexible, link_rad + twist
+    motor_rad = own.motor_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
+    error, slope, curvature = series_at(flexible.kinematic_error, motor_rad)
     inverse = 1.0 / (1.0 + slope)
-    target -= (target + error - ahead) * inverse
-    own.target_rad, own.ahead_rad, own.motor_per_link = target, ahead, inverse
+    motor_rad -= (motor_rad + error - ahead) * inverse
+    own.motor_rad, own.ahead_rad, own.motor_per_link = motor_rad, ahead, inverse
+    own.target_rad = reference.position_rad + _apart_now(constants, own, motor_rad - link_rad)
     motor_speed = speed * inverse
     motor_acceleration = (acceleration + compliance * bend - curvature * motor_speed * motor_speed) * inverse
-    motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, target)
+    motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, motor_rad)
     return flexible.motor_inertia_kgm2 * motor_acceleration + (1.0 + slope) * through + motor_friction
+
+
+@kernel
+def _apart_now(constants: LawConstants, own: FlexibleState, apart_rad: float) -> float:
+    """By how much the motor is to be ahead of the link now [rad], where it is to be so `feed_forward_lead_s` from now.
+
+    What was worked out then is kept; between two cycles it is linear.  Only the difference of both is: through an
+    overrun it hardly moves.
+    """
+    size = len(own.apart_rad)
+    if own.primed == 0:
+        for i in range(size):
+            own.apart_rad[i] = apart_rad
+    own.newest = (own.newest + 1) % size
+    own.apart_rad[own.newest] = apart_rad
+    cycles = min(constants.feed_forward_lead_s / constants.period_s, size - 2.0)
+    whole = int(cycles)
+    share = cycles - whole
+    at = own.newest - whole + size
+    return (1.0 - share) * own.apart_rad[at % size] + share * own.apart_rad[(at - 1) % size]
 
 
 @kernel

@@ -353,13 +353,11 @@ def friction_feed_forward_Nm(
 
 @kernel
 def _friction_Nm(
-    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, motor_rad: float,
+    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, ahead_rad: float,
     transmitted_Nm: float,
 ) -> float:  # fmt: skip
-    """The same for the motion desired `feed_forward_lead_s` later; adapted, of the desired motor angle / n as well."""
-    lead_s = constants.feed_forward_lead_s
-    desired_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
-    ahead_rad = motor_rad + lead_s * reference.velocity_radps
+    """The same for the motion desired `feed_forward_lead_s` later, `ahead_rad` that of the motor / n; perhaps adapted."""
+    desired_radps = reference.velocity_radps + constants.feed_forward_lead_s * reference.acceleration_radps2
     if constants.adaptation.enabled != 0:
         condition = _condition(constants, state, transmitted_Nm, ahead_rad)
         return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps, condition)
@@ -474,10 +472,8 @@ def step_law(
             position_rad - constants.gravity_zero_rad
         )
     transmitted_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm
-    state.friction_torque_Nm = _friction_Nm(
-        constants, state, velocity_radps, reference, reference.position_rad, transmitted_Nm
-    )
     ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
+    state.friction_torque_Nm = _friction_Nm(constants, state, velocity_radps, reference, ahead_rad, transmitted_Nm)
     state.friction_torque_Nm -= value_at(constants.flexible.torque_ripple, ahead_rad)
     faster_radps = abs(reference.velocity_radps) - state.observer.speed_radps
     state.observer.speed_radps += constants.period_s / AVERAGE_s * faster_radps
@@ -520,12 +516,15 @@ def step_flexible_law(
     if constants.of_arm != 0:
         state.gravity_torque_Nm = state.arm_torque_Nm
     elif constants.gravity_Nm != 0.0:
-        lever = reference.position_rad - constants.gravity_zero_rad
+        ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
+        lever = ahead_rad - constants.gravity_zero_rad
         state.gravity_torque_Nm = constants.gravity_Nm * math.sin(lever)
         gravity_slope_Nmprad = constants.gravity_Nm * math.cos(lever)
     transmitted_Nm = flexible.link_inertia_kgm2 * reference.acceleration_radps2 + state.gravity_torque_Nm
-    desired_rad = own.target_rad if own.primed != 0 else reference.position_rad
-    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, desired_rad, transmitted_Nm)
+    motor_rad = reference.position_rad
+    if own.primed != 0:
+        motor_rad = own.motor_rad + constants.period_s * reference.velocity_radps
+    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, motor_rad, transmitted_Nm)
     known_Nm = desired_motor(constants, state, reference, gravity_slope_Nmprad)
     state.inertia_torque_Nm = known_Nm - state.friction_torque_Nm - state.gravity_torque_Nm
     motor_rad, link_rad = motor_and_link_errors(flexible, own, reading, reference.position_rad)

@@ -118,6 +118,7 @@ NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
 KNEES = 2  # of the reducer's stiffness
+LEAD_HISTORY = 32  # cycles by which the feed-forward of a flexible joint can lead
 
 
 @record
@@ -237,8 +238,11 @@ class FlexibleConstants:
 class FlexibleState:
     primed: i4
     target_rad: f8  # theta_d
-    ahead_rad: f8  # theta_d and the kinematic error there
-    motor_per_link: f8  # slope of theta_d against that
+    motor_rad: f8  # theta_d of the motion that is fed forward
+    ahead_rad: f8  # that and the kinematic error there
+    motor_per_link: f8  # slope of the one against the other
+    apart_rad: Annotated[np.ndarray, array_of(f8, LEAD_HISTORY)]  # of each cycle, motor from link in that motion
+    newest: i4  # in it
     twist_error_rad: f8  # b
     motor_velocity: VelocityState
     link_velocity: VelocityState
