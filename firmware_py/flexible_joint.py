@@ -47,6 +47,7 @@ def reset_flexible(state: FlexibleState) -> None:
     """Nothing known of the twist; the next cycle begins with the errors that it finds."""
     state.primed = 0
     state.twist_error_rad = 0.0
+    state.link_deflection_rad = 0.0
     state.motor_velocity.primed = 0
     state.link_velocity.primed = 0
 
@@ -120,7 +121,8 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
         0.5 * reference.acceleration_radps2 + lead_s / 6.0 * reference.jerk_radps3
     )
     link_rad = reference.position_rad + lead_s * mean_radps
-    link_friction = flexible.link_friction_share * state.friction_torque_Nm
+    own = state.flexible
+    link_friction = own.link_friction_Nm
     through = flexible.link_inertia_kgm2 * acceleration + link_friction + state.gravity_torque_Nm
     bend = flexible.link_inertia_kgm2 * reference.snap_radps4  # the second derivative of that torque
     if constants.of_arm == 0:
@@ -128,17 +130,43 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
         bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
     twist, compliance = twist_of(flexible, through)
     # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
-    own, ahead = state.flexible, link_rad + twist
+    ahead = link_rad + twist
     motor_rad = own.motor_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
-    error, slope, curvature = series_at(flexible.kinematic_error, motor_rad)
+    _follow(flexible, own.followed, speed)
+    error, slope, curvature = series_at(own.followed, motor_rad)
     inverse = 1.0 / (1.0 + slope)
     motor_rad -= (motor_rad + error - ahead) * inverse
     own.motor_rad, own.ahead_rad, own.motor_per_link = motor_rad, ahead, inverse
+    before_rad, before_apart_rad = own.target_rad, own.apart_rad[own.newest]
     own.target_rad = reference.position_rad + _apart_now(constants, own, motor_rad - link_rad)
+    own.ahead_radps, own.target_radps = speed, reference.velocity_radps
+    if own.primed != 0:
+        own.ahead_radps += (motor_rad - link_rad - before_apart_rad) / constants.period_s
+        own.target_radps = (own.target_rad - before_rad) / constants.period_s
     motor_speed = speed * inverse
     motor_acceleration = (acceleration + compliance * bend - curvature * motor_speed * motor_speed) * inverse
     motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, motor_rad)
     return flexible.motor_inertia_kgm2 * motor_acceleration + (1.0 + slope) * through + motor_friction
+
+
+@inlined
+def _follow(flexible: FlexibleConstants, followed: HarmonicSeries, speed_radps: float) -> None:
+    """What the motor makes up for of the kinematic error at this speed, for no more than `following_Nm` in all.
+
+    A sine takes Jm A w^2, which grows with the square of the speed; the first in the list come first.
+    """
+    left_Nm = flexible.following_Nm
+    followed.count = flexible.kinematic_error.count
+    for i in range(followed.count):
+        amplitude = flexible.kinematic_error.amplitude[i]
+        omega_radps = 2.0 * math.pi * flexible.kinematic_error.turns_prad[i] * speed_radps
+        needed_Nm = flexible.motor_inertia_kgm2 * abs(amplitude) * omega_radps * omega_radps
+        if needed_Nm > left_Nm:
+            amplitude *= left_Nm / needed_Nm
+        left_Nm = max(left_Nm - needed_Nm, 0.0)
+        followed.amplitude[i] = amplitude
+        followed.turns_prad[i] = flexible.kinematic_error.turns_prad[i]
+        followed.phase_turns[i] = flexible.kinematic_error.phase_turns[i]
 
 
 @kernel
