@@ -13,9 +13,11 @@ The feed-forward takes the desired motion of the link through the reducer (the j
     theta_d = q_d + twist(tau_l) - eps(theta_d)
     tau_ff  = Jm theta_d'' + (1 + eps') tau_l + F_m - r(theta_d)
 
-eps is the kinematic error of the reducer and r the torque ripple, both sums of sines of the motor angle; theta_d''
-needs the fourth derivative of q_d.  With one encoder alone e_l = e_m: with the motor's, the link is where the
-feed-forward expects it; with the link's, the loop must be slow against the reducer's resonance.
+Of the motion `feed_forward_lead_s` from now: the torque is that late.  e_m is that against theta_d of now.  F_m goes
+with theta_d', twist included.  eps is the kinematic error of the reducer, as far as the motor has the torque to make up
+for it, and r the torque ripple, both sums of sines of the motor angle; theta_d'' needs the fourth derivative of q_d.
+With one encoder alone e_l = e_m: with the motor's, the link is where the feed-forward expects it; with the link's, the
+loop must be slow against the reducer's resonance.
 
 Not modelled: hysteresis and damping of the reducer, the rates of the friction in theta_d'', and in an arm those of what
 the other joints ask."""
@@ -113,10 +115,10 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
     Friction and gravity of that time are there already.
     """
     flexible, lead_s = constants.flexible, constants.feed_forward_lead_s
-    acceleration = reference.acceleration_radps2 + lead_s * (reference.jerk_radps3 + 0.5 * lead_s * reference.snap_radps4)
-    speed = reference.velocity_radps + lead_s * (
-        reference.acceleration_radps2 + 0.5 * lead_s * reference.jerk_radps3
+    acceleration = reference.acceleration_radps2 + lead_s * (
+        reference.jerk_radps3 + 0.5 * lead_s * reference.snap_radps4
     )
+    speed = reference.velocity_radps + lead_s * (reference.acceleration_radps2 + 0.5 * lead_s * reference.jerk_radps3)
     mean_radps = reference.velocity_radps + lead_s * (
         0.5 * reference.acceleration_radps2 + lead_s / 6.0 * reference.jerk_radps3
     )
