@@ -68,8 +68,6 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState) -> 
     state.newest = 0
     for i in range(len(state.fed_Nm)):
         state.fed_Nm[i] = 0.0
-        state.seen_rad[i] = 0.0
-        state.seen_radps[i] = 0.0
 
 
 @kernel
@@ -152,11 +150,6 @@ def adapt(
     """
     constants = law.adaptation
     share = law.observer.bandwidth_radps * law.period_s
-    size = len(state.fed_Nm)
-    state.seen_rad[state.newest] = position_rad
-    state.seen_radps[state.newest] = velocity_radps
-    seen = (state.newest - min(max(constants.seen_cycles, 0), size - 1) + size) % size
-    position_rad, velocity_radps = state.seen_rad[seen], state.seen_radps[seen]
     for k in range(BRISTLES):
         state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
         state.bristle.damping_Nmspr = 0.0  # of a measured speed: noise

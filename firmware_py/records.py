@@ -87,8 +87,7 @@ class AdaptationConstants:
     enabled: i4
     ripples: i4  # sines in use
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
-    seen_cycles: i4  # by which the observer is late, as its velocity is filtered
-    late_cycles: i4  # from what is fed forward to the friction that the observer compares it with, those included
+    late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
@@ -106,9 +105,7 @@ class AdaptationState:
     bristle: LuGreConstants  # of one kind of bristles, while they are computed
     fed_filtered_Nm: f8
     fed_Nm: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
-    seen_rad: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]  # the motion, as it was measured
-    seen_radps: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
-    newest: i4  # in these
+    newest: i4  # in it
     rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
     resting: i4
     cycle: i4

@@ -177,8 +177,7 @@ def _fill_law(law: LawConstants, config: Config) -> None:
         _fill_adaptation(law.adaptation, control.adaptation, joint.reduction_ratio)
         if control.observer_paired or control.kind == "flexible_joint":
             cycles = round(lead_s * config.loop.rate_Hz) or control.observer_delay_cycles + 1
-            law.adaptation.seen_cycles = seen = _seen_cycles(config)
-            law.adaptation.late_cycles = min(cycles + seen, FED_HISTORY - 1)
+            law.adaptation.late_cycles = min(cycles, FED_HISTORY - 1)
     if config.friction is not None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
         law.temperature.gain = -math.expm1(-period_s(config) / WARMING_S)
@@ -215,19 +214,6 @@ def _feed_forward_lead_s(config: Config) -> float:
     if delay_s is None:
         delay_s = config.drive.assumed_delay(config)[0]
     return delay_s + 0.5 * period_s(config) + config.margin.current_lag_s
-
-
-def _seen_cycles(config: Config) -> int:
-    """By which the observer of a flexible joint is late: the velocity of each mass is filtered."""
-    if config.reducer is None or encoders_of_law(config) != Encoders.BOTH:
-        return 0
-    link_share = 1.0 - config.reducer.motor_inertia_kgm2 / config.joint.inertia_kgm2
-    late_s = 0.5 * period_s(config)
-    for cutoff_Hz, share in (
-        (config.control.velocity_cutoff_Hz, 1.0 - link_share), (config.control.link_cutoff_Hz, link_share)
-    ):  # fmt: skip
-        late_s += share / (math.tau * cutoff_Hz) if cutoff_Hz > 0.0 else 0.0
-    return round(late_s * config.loop.rate_Hz)
 
 
 def _fill_adaptation(record: AdaptationConstants, adaptation: Adaptation, ratio: float) -> None:
