@@ -13,9 +13,11 @@ The feed-forward takes the desired motion of the link through the reducer (the j
     theta_d = q_d + twist(tau_l) - eps(theta_d)
     tau_ff  = Jm theta_d'' + (1 + eps') tau_l + F_m - r(theta_d)
 
-eps is the kinematic error of the reducer and r the torque ripple, both sums of sines of the motor angle; theta_d''
-needs the fourth derivative of q_d.  With one encoder alone e_l = e_m: with the motor's, the link is where the
-feed-forward expects it; with the link's, the loop must be slow against the reducer's resonance.
+Of the motion `feed_forward_lead_s` from now: the torque is that late.  e_m is that against theta_d of now.  F_m goes
+with theta_d', twist included.  eps is the kinematic error of the reducer, as far as the motor has the torque to make up
+for it, and r the torque ripple, both sums of sines of the motor angle; theta_d'' needs the fourth derivative of q_d.
+With one encoder alone e_l = e_m: with the motor's, the link is where the feed-forward expects it; with the link's, the
+loop must be slow against the reducer's resonance.
 
 Not modelled: hysteresis and damping of the reducer, the rates of the friction in theta_d'', and in an arm those of what
 the other joints ask."""
@@ -47,6 +49,7 @@ def reset_flexible(state: FlexibleState) -> None:
     """Nothing known of the twist; the next cycle begins with the errors that it finds."""
     state.primed = 0
     state.twist_error_rad = 0.0
+    state.link_deflection_rad = 0.0
     state.motor_velocity.primed = 0
     state.link_velocity.primed = 0
 
@@ -107,10 +110,21 @@ def twist_of(constants: FlexibleConstants, torque_Nm: float) -> tuple[float, flo
 
 @kernel
 def desired_motor(constants: LawConstants, state: LawState, reference: Reference, gravity_slope_Nmprad: float) -> float:
-    """Feed-forward torque [Nm]; leaves theta_d in the state.  Friction and gravity of this cycle are there already."""
-    flexible = constants.flexible
-    speed, acceleration = reference.velocity_radps, reference.acceleration_radps2
-    link_friction = flexible.link_friction_share * state.friction_torque_Nm
+    """Feed-forward torque [Nm] of the motion `feed_forward_lead_s` from now; leaves theta_d of now in the state.
+
+    Friction and gravity of that time are there already.
+    """
+    flexible, lead_s = constants.flexible, constants.feed_forward_lead_s
+    acceleration = reference.acceleration_radps2 + lead_s * (
+        reference.jerk_radps3 + 0.5 * lead_s * reference.snap_radps4
+    )
+    speed = reference.velocity_radps + lead_s * (reference.acceleration_radps2 + 0.5 * lead_s * reference.jerk_radps3)
+    mean_radps = reference.velocity_radps + lead_s * (
+        0.5 * reference.acceleration_radps2 + lead_s / 6.0 * reference.jerk_radps3
+    )
+    link_rad = reference.position_rad + lead_s * mean_radps
+    own = state.flexible
+    link_friction = own.link_friction_Nm
     through = flexible.link_inertia_kgm2 * acceleration + link_friction + state.gravity_torque_Nm
     bend = flexible.link_inertia_kgm2 * reference.snap_radps4  # the second derivative of that torque
     if constants.of_arm == 0:
@@ -118,16 +132,63 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
         bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
     twist, compliance = twist_of(flexible, through)
     # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
-    own, ahead = state.flexible, reference.position_rad + twist
-    target = own.target_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
-    error, slope, curvature = series_at(flexible.kinematic_error, target)
+    ahead = link_rad + twist
+    motor_rad = own.motor_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
+    _follow(flexible, own.followed, speed)
+    error, slope, curvature = series_at(own.followed, motor_rad)
     inverse = 1.0 / (1.0 + slope)
-    target -= (target + error - ahead) * inverse
-    own.target_rad, own.ahead_rad, own.motor_per_link = target, ahead, inverse
+    motor_rad -= (motor_rad + error - ahead) * inverse
+    own.motor_rad, own.ahead_rad, own.motor_per_link = motor_rad, ahead, inverse
+    before_rad, before_apart_rad = own.target_rad, own.apart_rad[own.newest]
+    own.target_rad = reference.position_rad + _apart_now(constants, own, motor_rad - link_rad)
+    own.ahead_radps, own.target_radps = speed, reference.velocity_radps
+    if own.primed != 0:
+        own.ahead_radps += (motor_rad - link_rad - before_apart_rad) / constants.period_s
+        own.target_radps = (own.target_rad - before_rad) / constants.period_s
     motor_speed = speed * inverse
     motor_acceleration = (acceleration + compliance * bend - curvature * motor_speed * motor_speed) * inverse
-    motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, target)
+    motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, motor_rad)
     return flexible.motor_inertia_kgm2 * motor_acceleration + (1.0 + slope) * through + motor_friction
+
+
+@inlined
+def _follow(flexible: FlexibleConstants, followed: HarmonicSeries, speed_radps: float) -> None:
+    """What the motor makes up for of the kinematic error at this speed, for no more than `following_Nm` in all.
+
+    A sine takes Jm A w^2, which grows with the square of the speed; the first in the list come first.
+    """
+    left_Nm = flexible.following_Nm
+    followed.count = flexible.kinematic_error.count
+    for i in range(followed.count):
+        amplitude = flexible.kinematic_error.amplitude[i]
+        omega_radps = 2.0 * math.pi * flexible.kinematic_error.turns_prad[i] * speed_radps
+        needed_Nm = flexible.motor_inertia_kgm2 * abs(amplitude) * omega_radps * omega_radps
+        if needed_Nm > left_Nm:
+            amplitude *= left_Nm / needed_Nm
+        left_Nm = max(left_Nm - needed_Nm, 0.0)
+        followed.amplitude[i] = amplitude
+        followed.turns_prad[i] = flexible.kinematic_error.turns_prad[i]
+        followed.phase_turns[i] = flexible.kinematic_error.phase_turns[i]
+
+
+@kernel
+def _apart_now(constants: LawConstants, own: FlexibleState, apart_rad: float) -> float:
+    """By how much the motor is to be ahead of the link now [rad], where it is to be so `feed_forward_lead_s` from now.
+
+    What was worked out then is kept; between two cycles it is linear.  Only the difference of both is: through an
+    overrun it hardly moves.
+    """
+    size = len(own.apart_rad)
+    if own.primed == 0:
+        for i in range(size):
+            own.apart_rad[i] = apart_rad
+    own.newest = (own.newest + 1) % size
+    own.apart_rad[own.newest] = apart_rad
+    cycles = min(constants.feed_forward_lead_s / constants.period_s, size - 2.0)
+    whole = int(cycles)
+    share = cycles - whole
+    at = own.newest - whole + size
+    return (1.0 - share) * own.apart_rad[at % size] + share * own.apart_rad[(at - 1) % size]
 
 
 @kernel

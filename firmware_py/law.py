@@ -356,13 +356,10 @@ def friction_feed_forward_Nm(
 
 @kernel
 def _friction_Nm(
-    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, motor_rad: float,
+    constants: LawConstants, state: LawState, velocity_radps: float, desired_radps: float, ahead_rad: float,
     transmitted_Nm: float,
 ) -> float:  # fmt: skip
-    """The same for the motion desired `feed_forward_lead_s` later; adapted, of the desired motor angle / n as well."""
-    lead_s = constants.feed_forward_lead_s
-    desired_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
-    ahead_rad = motor_rad + lead_s * reference.velocity_radps
+    """The same, perhaps adapted, for the motion of the motor / n that is fed forward."""
     if constants.adaptation.enabled != 0:
         condition = _condition(constants, state, transmitted_Nm, ahead_rad)
         return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps, condition)
@@ -477,10 +474,9 @@ def step_law(
             position_rad - constants.gravity_zero_rad
         )
     transmitted_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm
-    state.friction_torque_Nm = _friction_Nm(
-        constants, state, velocity_radps, reference, reference.position_rad, transmitted_Nm
-    )
-    ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
+    ahead_rad = reference.position_rad + lead_s * reference.velocity_radps
+    ahead_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
+    state.friction_torque_Nm = _friction_Nm(constants, state, velocity_radps, ahead_radps, ahead_rad, transmitted_Nm)
     state.friction_torque_Nm -= value_at(constants.flexible.torque_ripple, ahead_rad)
     faster_radps = abs(reference.velocity_radps) - state.observer.speed_radps
     state.observer.speed_radps += constants.period_s / AVERAGE_s * faster_radps
@@ -508,6 +504,19 @@ def step_law(
 
 
 @kernel
+def _link_friction(constants: LawConstants, state: LawState, link_radps: float, condition: Condition) -> None:
+    """That share of the friction which the reducer transmits, of the motion that is fed forward."""
+    own, share = state.flexible, constants.flexible.link_friction_share
+    own.link_friction_Nm = share * state.friction_torque_Nm
+    if constants.feed_forward == FeedForward.LUGRE_DESIRED:
+        own.link_deflection_rad, torque_Nm = step_lugre(
+            constants.lugre, constants.friction, constants.reduction_ratio, own.link_deflection_rad, link_radps,
+            constants.period_s, condition,
+        )  # fmt: skip
+        own.link_friction_Nm = share * torque_Nm
+
+
+@kernel
 def step_flexible_law(
     constants: LawConstants,
     state: LawState,
@@ -523,12 +532,19 @@ def step_flexible_law(
     if constants.of_arm != 0:
         state.gravity_torque_Nm = state.arm_torque_Nm
     elif constants.gravity_Nm != 0.0:
-        lever = reference.position_rad - constants.gravity_zero_rad
+        ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
+        lever = ahead_rad - constants.gravity_zero_rad
         state.gravity_torque_Nm = constants.gravity_Nm * math.sin(lever)
         gravity_slope_Nmprad = constants.gravity_Nm * math.cos(lever)
     transmitted_Nm = flexible.link_inertia_kgm2 * reference.acceleration_radps2 + state.gravity_torque_Nm
-    desired_rad = own.target_rad if own.primed != 0 else reference.position_rad
-    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, desired_rad, transmitted_Nm)
+    ahead_radps = reference.velocity_radps + constants.feed_forward_lead_s * reference.acceleration_radps2
+    motor_rad, motor_radps = reference.position_rad, ahead_radps
+    if own.primed != 0:
+        motor_rad = own.motor_rad + constants.period_s * reference.velocity_radps
+        if constants.feed_forward == FeedForward.LUGRE_DESIRED:  # its bristles bend by as little as the reducer twists
+            motor_radps = own.ahead_radps
+    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, motor_radps, motor_rad, transmitted_Nm)
+    _link_friction(constants, state, ahead_radps, _condition(constants, state, transmitted_Nm, motor_rad))
     known_Nm = desired_motor(constants, state, reference, gravity_slope_Nmprad)
     state.inertia_torque_Nm = known_Nm - state.friction_torque_Nm - state.gravity_torque_Nm
     motor_rad, link_rad = motor_and_link_errors(flexible, own, reading, reference.position_rad)
@@ -541,7 +557,8 @@ def step_flexible_law(
     )
     if constants.adaptation.enabled != 0:
         known_Nm -= state.friction_torque_Nm
-        _adapt(constants, state, reference.velocity_radps, own.target_rad + motor_rad, rate_radps, transmitted_Nm)
+        moving_radps = own.target_radps if reference.velocity_radps != 0.0 else 0.0
+        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, rate_radps, transmitted_Nm)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

@@ -118,6 +118,7 @@ NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
 KNEES = 2  # of the reducer's stiffness
+LEAD_HISTORY = 32  # cycles by which the feed-forward of a flexible joint can lead
 
 
 @record
@@ -227,6 +228,7 @@ class FlexibleConstants:
     stiffening_radpNm: Annotated[np.ndarray, array_of(f8, KNEES)]  # by which the compliance falls at each knee
     knee_Nm: Annotated[np.ndarray, array_of(f8, KNEES)]
     kinematic_error: HarmonicSeries  # [rad]
+    following_Nm: f8  # that the motor may take to make up for it
     torque_ripple: HarmonicSeries  # [Nm]; the laws of a rigid joint feed it forward as well
     twist_gain: f8  # of the slow correction of the twist, of one period
     motor_velocity: VelocityConstants
@@ -237,8 +239,16 @@ class FlexibleConstants:
 class FlexibleState:
     primed: i4
     target_rad: f8  # theta_d
-    ahead_rad: f8  # theta_d and the kinematic error there
-    motor_per_link: f8  # slope of theta_d against that
+    target_radps: f8
+    motor_rad: f8  # theta_d of the motion that is fed forward
+    ahead_rad: f8  # that and the kinematic error there
+    ahead_radps: f8  # its speed
+    followed: HarmonicSeries  # the part of the kinematic error that the motor makes up for
+    link_friction_Nm: f8  # of that motion
+    link_deflection_rad: f8  # of its bristles
+    motor_per_link: f8  # slope of the one against the other
+    apart_rad: Annotated[np.ndarray, array_of(f8, LEAD_HISTORY)]  # of each cycle, motor from link in that motion
+    newest: i4  # in it
     twist_error_rad: f8  # b
     motor_velocity: VelocityState
     link_velocity: VelocityState

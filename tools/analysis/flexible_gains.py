@@ -45,6 +45,7 @@ _START = {
 _COLUMNS = {Encoders.BOTH: [0, 1], Encoders.MOTOR: [1], Encoders.LINK: [0]}  # of link and motor, what the law reads
 _LOWEST_Hz = {Encoders.BOTH: 0.3, Encoders.MOTOR: 0.3, Encoders.LINK: 0.1}  # of the error that counts
 _POINTS = 250
+_SOFTER = 4  # times that the start is halved
 _EVALUATIONS = {2: 80, 3: 160}  # by how many are searched
 
 
@@ -154,6 +155,10 @@ def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
     start = _START[settings.encoders]
     counts_rad = np.array([law_resolution_rad(config), abs(joint_rad_per_count(config))])  # link, motor
     search = _Search(settings, counts_rad[_COLUMNS[settings.encoders]])
+    for _ in range(_SOFTER):  # where no joint of the simplex is stable, the search would learn nothing
+        if search.judged(_with_gains(settings, start)).s_anywhere < UNSTABLE:
+            break
+        start = start - math.log(2.0)
     steps = 0.4 * np.vstack((np.zeros(len(start)), -np.eye(len(start))))
     found = minimize(
         lambda x: search.judged(_with_gains(settings, x)).cost, start, method="Nelder-Mead",

@@ -122,7 +122,7 @@ class Control(Section):
     # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
     twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0
     link_cutoff_Hz: Annotated[float, between(0.0, 2000.0)] = 60.0  # of the link's velocity there; 0 = no filter
-    # of friction and inertia: the motion desired so much later, as torque is late; auto: loop delay, half a period, lag
+    # of the feed-forward: the motion desired so much later, as torque is late; auto: loop delay, half a period, lag
     feed_forward_lead_s: Annotated[float | Literal["auto"], auto_or_number(0.0, 0.02)] = 0.0
     adaptation: Adaptation | None = None
     learning: Learning | None = None

@@ -29,6 +29,7 @@ from jointctl.firmware_py.records import (
 )
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import (
+    CommandKind,
     ControllerKind,
     Encoders,
     FeedForward,
@@ -64,6 +65,7 @@ NOISE_S = 0.25  # that the mean change of the torque command is taken over
 NOISE_OF_RATE = (
     0.6  # share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
 )
+FOLLOWING_SHARE = 0.3  # of the torque limit, that goes at most into the kinematic error of a reducer
 RIPPLE_MOST = 4.0  # of what the adaptation takes for torque ripple, times what is expected
 WARMING_S = 2.0  # in which the friction feed-forward follows a new reading of the temperature
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
@@ -205,6 +207,8 @@ def _feed_forward_lead_s(config: Config) -> float:
     lead_s = config.control.feed_forward_lead_s
     if lead_s != "auto":
         return lead_s
+    if config.drive.own_loop() is not CommandKind.TORQUE:
+        return 0.0  # what is sent there leads as a whole
     delay_s = config.margin.loop_delay_s
     if delay_s is None:
         delay_s = config.drive.assumed_delay(config)[0]
@@ -227,6 +231,7 @@ def _fill_flexible(record: FlexibleConstants, config: Config, reducer: Reducer) 
     record.motor_inertia_kgm2 = reducer.motor_inertia_kgm2
     record.link_inertia_kgm2 = config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2
     record.link_friction_share = reducer.link_friction_share
+    record.following_Nm = FOLLOWING_SHARE * config.limits.torque_max_Nm
     record.compliance_radpNm = compliance = 1.0 / reducer.stiffness_Nmprad
     for i, (knee_Nm, stiffness) in enumerate(zip(reducer.knees_Nm, reducer.stiffness_beyond_Nmprad, strict=True)):
         record.knee_Nm[i] = knee_Nm

@@ -48,7 +48,7 @@ def flexible_law(**gains: float) -> tuple[Any, Any]:
     law.inertia_kgm2, law.reduction_ratio, law.gravity_Nm = JM + JL, RATIO, 12.0
     law.kp, law.kv = gains.get("kp", 0.0), gains.get("kv", 0.0)
     law.observer.bandwidth_radps = gains.get("observer", 0.0)
-    flexible.motor_inertia_kgm2, flexible.link_inertia_kgm2 = JM, JL
+    flexible.motor_inertia_kgm2, flexible.link_inertia_kgm2, flexible.following_Nm = JM, JL, 60.0
     compliance = flexible.compliance_radpNm = 1.0 / SLOPES[0]
     for i, (knee, slope) in enumerate(zip(KNEES_Nm, SLOPES[1:], strict=True)):
         flexible.knee_Nm[i], flexible.stiffening_radpNm[i] = knee, compliance - 1.0 / slope
@@ -98,21 +98,29 @@ def test_the_derivatives_of_a_series() -> None:
 
 
 @kernel
-def follow(law_c, law_s, plant_c, plant_s, reference, amplitude_rad, omega_radps, snap_share, errors):
-    """The feed-forward alone, at every substep of the plant, on a sine that begins at its crest."""
+def follow(law_c, law_s, plant_c, plant_s, reference, amplitude_rad, omega_radps, snap_share, errors, late):
+    """The feed-forward alone, at every substep of the plant, on a sine that begins at its crest.
+
+    Its torques wait in `late` (N,), and begin with the first one: the motion begins at rest.
+    """
     for k in range(len(errors)):
         phase = omega_radps * k * plant_c.step_s
         reference.position_rad = amplitude_rad * math.cos(phase)
         reference.velocity_radps = -amplitude_rad * omega_radps * math.sin(phase)
         reference.acceleration_radps2 = -amplitude_rad * omega_radps**2 * math.cos(phase)
+        reference.jerk_radps3 = amplitude_rad * omega_radps**3 * math.sin(phase)
         reference.snap_radps4 = snap_share * amplitude_rad * omega_radps**4 * math.cos(phase)
         reading = Reading(plant_s.joint_position_rad, plant_s.motor_position_rad, 1)
         torque = step_flexible_law(law_c, law_s, reading, reference, 0.0, NO_REPETITION)
         if k == 0:
             plant_s.joint_position_rad = reference.position_rad
             plant_s.motor_position_rad = law_s.flexible.target_rad
+            for i in range(len(late)):
+                late[i] = torque
         errors[k, 0] = plant_s.joint_position_rad - reference.position_rad
         errors[k, 1] = plant_s.motor_position_rad - law_s.flexible.target_rad
+        if len(late) > 0:
+            late[k % len(late)], torque = torque, late[k % len(late)]
         step_plant(plant_c, plant_s, torque)
 
 
@@ -121,7 +129,7 @@ def test_the_feed_forward_alone_moves_the_link_as_desired(frequency_Hz: float) -
     """Nothing damps here: an error of sign or of size in any of the terms would ring on."""
     (law, state), (c, s) = flexible_law(), flexible_plant()
     errors = np.zeros((round(0.5 / 50e-6), 2))
-    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * frequency_Hz, 1.0, errors)
+    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * frequency_Hz, 1.0, errors, np.zeros(0))
     # the twist is up to 1 mrad here, the kinematic error 0.14 mrad
     assert np.max(np.abs(errors)) < 3e-5
 
@@ -138,7 +146,7 @@ def test_each_term_of_the_feed_forward_is_needed(left_out: str) -> None:
         law[0].gravity_Nm = 0.0
     else:
         flexible[left_out] = 0.0
-    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors)
+    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors, np.zeros(0))
     assert np.max(np.abs(errors)) > 6e-5
 
 
@@ -147,9 +155,35 @@ def test_a_quick_motion_needs_its_fourth_derivative() -> None:
     for snap_share in (1.0, 0.0):
         (law, state), (c, s) = flexible_law(), flexible_plant()
         errors = np.zeros((round(0.5 / 50e-6), 2))
-        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.05, math.tau * 3.0, snap_share, errors)
+        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.05, math.tau * 3.0, snap_share, errors, np.zeros(0))
         found.append(float(np.max(np.abs(errors))))
     assert found[0] < 0.3 * found[1]
+
+
+def test_the_feed_forward_leads_by_as_much_as_the_torque_is_late() -> None:
+    """Torsion and kinematic error included; what the readings are compared with does not lead."""
+    late_steps, found = 24, []
+    for lead_s in (late_steps * 50e-6, 0.0):
+        (law, state), (c, s) = flexible_law(), flexible_plant()
+        law[0].feed_forward_lead_s = lead_s
+        errors = np.zeros((round(0.5 / 50e-6), 2))
+        late = np.zeros(late_steps)
+        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors, late)
+        found.append(float(np.max(np.abs(errors))))
+    assert found[0] < 0.2 * found[1]
+
+
+@pytest.mark.parametrize("following_Nm", [0.0, 5.0, 60.0])
+def test_no_more_torque_than_is_set_goes_into_the_kinematic_error(following_Nm: float) -> None:
+    (law, state), reference, torques = flexible_law(), new(Reference)[0], []
+    law[0].flexible.following_Nm, law[0].gravity_Nm, law[0].flexible.torque_ripple.count = following_Nm, 0.0, 0
+    reference.velocity_radps = 1.5
+    for k in range(400):
+        reference.position_rad = 1.5 * k * 50e-6
+        reading = Reading(reference.position_rad, reference.position_rad, 1)
+        torques.append(step_flexible_law(law[0], state[0], reading, reference, 0.0, NO_REPETITION))
+    # both sines at 1.5 rad/s: 1.2 kg m^2 times 1e-4 rad (363 rad/s)^2, and 4e-5 rad (726 rad/s)^2
+    assert np.max(np.abs(torques)) == pytest.approx(min(following_Nm, 15.8 + 25.3), rel=0.15, abs=1e-9)
 
 
 # --- the errors ---
