@@ -45,6 +45,7 @@ from jointctl.tools.tuning.found_values import (
     values_of_fit,
     with_break_away,
     with_friction,
+    with_sliding,
     with_tuned,
     with_values,
     without_friction,
@@ -238,6 +239,15 @@ class Tune:
         numbers = [finding["numbers"].get("break_away_Nm", 0.0) for finding in self.state["direction"]]
         return with_break_away(self.config, max(numbers)) if max(numbers) > 0.0 else without_friction(self.config)
 
+    def _sliding(self) -> Config:
+        """With what the legs of the response say of the friction: at low speed a soft law sticks without it."""
+        config, kept = self._before_friction(), self.state["response"]["gravity"]
+        static_Nm = static_friction_Nm(config)
+        if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
+            return config
+        positive_Nm, negative_Nm = kept["sliding_Nm"]
+        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value)
+
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
         self.config = with_values(self.config, self._fitted())
@@ -309,7 +319,7 @@ class Tune:
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
         options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
-        command = Sweep(self._before_friction(), self.carrier.quietly(), path, options)
+        command = Sweep(self._sliding(), self.carrier.quietly(), path, options)
         command.control = control = self.carrier.control
         try:
             ended = command.run()
