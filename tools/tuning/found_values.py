@@ -22,7 +22,7 @@ MARK = "# tuned by jointctl: "
 SMALL_MOTION = 1.6  # stiffness of a small motion over that under a steady torque: hysteresis, 1.4 to 1.84
 CRITICAL_SHARE = 0.04  # of the critical damping: what is more is hysteresis, which a small motion does not have
 DIGITS = 5
-STANDS_radps, KNEE_radps = 1e-3, 1.0  # of a friction of which no curve is known: static below, straight on beyond
+STANDS_radps, KNEE_radps = 1e-3, 0.4  # of a friction of which no curve is known: static below, constant beyond
 
 
 @dataclass(frozen=True)
@@ -116,29 +116,30 @@ def with_break_away(config: Config, torque_Nm: float) -> Config:
 def with_sliding(config: Config, torque_Nm: float, sliding_Nm: tuple[float, float], slope_Nmspr: float) -> Config:
     """As `with_break_away`, and the friction of the response's legs is fed forward: a law that is soft needs it.
 
-    `sliding_Nm` at SPEED_radps, `slope_Nmspr` there.  What is more at lower speeds is not known yet.
+    `sliding_Nm` at SPEED_radps, with its sign, `slope_Nmspr` there.  What is more at lower speeds is not known yet, and
+    beyond KNEE_radps nothing is added.
     """
-    slope_Nmspr = max(slope_Nmspr, 0.0)
-    least = [0.5 * abs(side) for side in sliding_Nm]
-    coulomb = [max(abs(side) - SPEED_radps * slope_Nmspr, low) for side, low in zip(sliding_Nm, least, strict=True)]
-    friction = _straight(torque_Nm, (coulomb[0], coulomb[1]), slope_Nmspr)
+    sizes = max(sliding_Nm[0], 0.0), max(-sliding_Nm[1], 0.0)  # a load may be more than the friction
+    slope_Nmspr = min(max(slope_Nmspr, 0.0), 0.5 * min(sizes) / SPEED_radps)
+    coulomb = (sizes[0] - SPEED_radps * slope_Nmspr, sizes[1] - SPEED_radps * slope_Nmspr)
+    friction = _straight(torque_Nm, coulomb, slope_Nmspr)
     before = with_break_away(config, torque_Nm)
     control = before.control.model_copy(update={"feed_forward": "desired"})
     return before.model_copy(update={"friction": friction, "control": control})
 
 
 def _straight(static_Nm: float, coulomb_Nm: tuple[float, float], slope_Nmspr: float) -> Friction:
-    """Coulomb and viscous friction of either direction, at the joint; the static one at standstill alone."""
-    sides = []
-    for sign, coulomb in zip((1.0, -1.0), coulomb_Nm, strict=True):
-        sides.append(
-            FrictionDirection(
-                tc_Nm=coulomb, ts_Nm=max(static_Nm, coulomb), ws=STANDS_radps, tv=slope_Nmspr, a0=sign * coulomb,
-                a1=slope_Nmspr, a2=0.0, a3=0.0, knee=sign * KNEE_radps, max=sign * KNEE_radps,
-            )  # fmt: skip
-        )
+    """Coulomb and viscous friction of either direction, at the joint; the static one counts at standstill alone."""
+
+    def side(sign: float, coulomb: float) -> FrictionDirection:
+        return FrictionDirection(
+            tc_Nm=coulomb, ts_Nm=max(static_Nm, coulomb), ws=STANDS_radps, tv=slope_Nmspr,
+            a0=sign * (coulomb + KNEE_radps * slope_Nmspr), a1=0.0, a2=0.0, a3=0.0, knee=sign * KNEE_radps, max=sign,
+        )  # fmt: skip
+
+    positive, negative = side(1.0, coulomb_Nm[0]), side(-1.0, coulomb_Nm[1])
     return Friction(
-        velocity_unit="rad/s", velocity_side="joint", torque_side="joint", positive=sides[0], negative=sides[1]
+        velocity_unit="rad/s", velocity_side="joint", torque_side="joint", positive=positive, negative=negative
     )
 
 

@@ -282,7 +282,8 @@ class _Search:
         return Judged(
             settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)), min(phases), min(gains), max(peaks),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
-            min((phase for phase, _, _ in gate), default=90.0), max((peak for _, _, peak in gate), default=1.0), settling,
+            min((phase for phase, _, _ in gate), default=90.0), max((peak for _, _, peak in gate), default=1.0),
+            settling,
         )  # fmt: skip
 
 
