@@ -60,6 +60,7 @@ LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow it
 LEAST_STIFFNESS_SHARE = 0.1
 LEAST_LATE_s = 0.1e-3
 GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
+TWO_ENCODERS = "[joint_encoder] beside an encoder on the motor"
 SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
@@ -117,16 +118,18 @@ LAWS = {
 }  # fmt: skip
 
 
+def has_both_encoders(config: Config) -> bool:
+    """One on the motor, which [encoder] describes, and one behind the reducer."""
+    return config.joint_encoder is not None and config.encoder.side == "motor"
+
+
 def chosen_law(config: Config, fit: JointFit, wanted: str) -> Law:
     """`wanted` "auto": both encoders where the reducer is soft and there are two, else the precise one."""
-    both = config.joint_encoder is not None and config.encoder.side == "motor"
+    both = has_both_encoders(config)
     if wanted == "auto":
         wanted = "two_encoders" if fit.flexible and both else "precise"
     if wanted == "two_encoders" and not (fit.flexible and both):
-        raise ConfigurationError(
-            f"{config.path}: --law (=two_encoders) needs [joint_encoder] beside an encoder on the motor, and a joint "
-            "whose reducer is seen to be soft"
-        )
+        raise ConfigurationError(f"--law (=two_encoders) needs {TWO_ENCODERS}, and a reducer that is seen to be soft")
     return LAWS[wanted]
 
 

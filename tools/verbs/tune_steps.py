@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError, JointctlError, MarginError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -51,7 +51,7 @@ from jointctl.tools.tuning.found_values import (
     without_friction,
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, from_dict
-from jointctl.tools.tuning.gains import ChosenGains, choose_gains
+from jointctl.tools.tuning.gains import TWO_ENCODERS, ChosenGains, choose_gains, has_both_encoders
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
 from jointctl.tools.tuning.measured_response import (
     measured_response,
@@ -100,6 +100,8 @@ class Tune:
     def __post_init__(self) -> None:
         limits, torque_Nm = self.original.limits, self.options.torque_Nm
         self.config = self.original
+        if self.options.law == "two_encoders" and not has_both_encoders(self.original):
+            raise ConfigurationError(f"{self.original.path}: --law (=two_encoders) needs {TWO_ENCODERS}")
         if torque_Nm is not None:
             if not 0.0 < torque_Nm <= limits.torque_max_Nm:
                 raise UsageError(
