@@ -67,6 +67,7 @@ QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 LEARNING_FACTOR = 0.9  # of a repetition, at most
 _LOWEST_Hz, _POINTS = 0.3, 240
+_NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 2, 90
 
 
@@ -240,7 +241,7 @@ class _Search:
         self.law, self.nominal = law, settings
         self.tried: list[Judged] = []
         period_s = self.nominal.period_s
-        self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / period_s, _POINTS)
+        self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
         late_s = settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
@@ -288,6 +289,16 @@ class _Search:
             min((phase for phase, _, _ in gate), default=90.0), max((peak for _, _, peak in gate), default=1.0),
             settling,
         )  # fmt: skip
+
+
+def _frequencies_radps(config: Config, period_s: float) -> Array:
+    """Up to half the rate; closer about a resonance, whose peak is narrower than the other steps."""
+    highest = math.pi / period_s
+    omega: Array = np.geomspace(math.tau * _LOWEST_Hz, highest, _POINTS)
+    if config.reducer is None:
+        return omega
+    near = math.tau * two_masses(config, config.reducer, 1.0, 1.0, False).resonance_Hz * np.geomspace(*_NEAR)
+    return np.unique(np.concatenate((omega, near[near < highest])))
 
 
 def _margins(open_loop: ComplexArray) -> tuple[float, float, float]:
