@@ -32,9 +32,9 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
     unknown = with_break_away(config, static_Nm)
     if step.name == "friction":
         if config.friction is not None:  # and what the response adds
-            constants = friction_constants(config.friction, config.joint.reduction_ratio)
+            curve = friction_constants(config.friction, config.joint.reduction_ratio)
             at_radps = np.array([SPEED_radps, -SPEED_radps])
-            sliding = config.joint.reduction_ratio * friction_curve_Nm(constants, at_radps)
+            sliding = config.joint.reduction_ratio * friction_curve_Nm(curve, at_radps)
             unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0)
         return placed_sweep(unknown, joint, step.strokes, start_rad)
     if step.name == "direction":
