@@ -215,6 +215,12 @@ class LockstepJoint:
         self.plant_constants = virtual.plant_constants.copy()
         self.plant_state = virtual.plant_state.copy()
 
+    @property
+    def quick_stop_radps2(self) -> float:
+        """With which the drive brakes at a quick stop."""
+        device = self._virtual.device[0]
+        return float(device.drive.quick_stop_deceleration / abs(device.counts_per_rad))
+
     def constants(self) -> Any:
         """Fresh `AxisConstants` for this joint where it stands; may be changed before `run`."""
         constants = axis_constants(self.config, self.table, start_position_rad=self.report.start_position_rad)

@@ -137,6 +137,15 @@ def test_no_scenario_violates_an_invariant_in_the_steps_of_a_tune(tuned: tuple[C
     assert sum(v.fault != "NONE" for v in found) > len(found) // 4
 
 
+def test_no_scenario_violates_an_invariant_in_the_steps_of_a_soft_joint() -> None:
+    """Two encoders; a quick stop along 6085 that is slower than friction alone: scenario 24 of seed 880612 with it."""
+    soft = campaign_joint(load_config(CONFIGS / "realistic.toml"), "tune")
+    drawn = [draw_scenario(880611, number, "tune") for number in range(KINDS)]
+    found = [judge(*soft, one, placed_step) for one in (*drawn, draw_scenario(880612, 24, "tune"))]
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert {v.fault for v in found} >= {"POSITION_DISAGREEMENT", "VELOCITY_LIMIT"}
+
+
 def test_behind_a_stuck_encoder_no_step_of_a_tune_runs_away(tuned: tuple[Config, LockstepJoint]) -> None:
     """Scenario 206 of seed 880603 went 3.3 rad/s while nothing knew the torque that moves the joint."""
     verdict = judge(*tuned, draw_scenario(880603, 206, "tune"), placed_step)
@@ -228,6 +237,26 @@ def test_there_a_reading_that_stands_still_for_one_sample_is_harmless() -> None:
     assert fitted(config, twin).duration_s == 0.5e-3
     assert judge(config, joint, twin).violations == ()
     assert fitted(shipped(), twin) == twin
+
+
+def test_a_slow_quick_stop_of_the_drive_brakes_less_than_friction(virtual_config: Config) -> None:
+    joint = LockstepJoint(virtual_config)
+    plain = envelope(virtual_config, REVERSED, joint.constants()[0])
+    assert envelope(virtual_config, REVERSED, joint.constants()[0], joint.quick_stop_radps2) == plain  # 12 rad/s2
+    slow = envelope(virtual_config, REVERSED, joint.constants()[0], 0.8)
+    speed = plain.velocity_max_radps
+    assert slow.stop_s == pytest.approx(0.01 + speed / 0.8 + 1.0)
+    assert slow.position_max_rad - virtual_config.limits.position_max_rad > speed**2 / 1.6
+
+
+def test_a_drift_beside_another_encoder_is_harmless_within_what_they_may_differ_by() -> None:
+    twin = dataclasses.replace(draw_scenario(880611, 53, "tune"), duration_s=0.97, magnitude=-0.007)
+    assert (twin.kind, twin.harmless) == (FaultKind.ENCODER_DRIFT, True)
+    both = load_config(CONFIGS / "realistic.toml")
+    assert both.joint_encoder is not None
+    assert fitted(both, twin).duration_s == pytest.approx(0.5 * both.joint_encoder.disagreement_max_rad / 0.007)
+    for config, other in ((shipped(), twin), (both, dataclasses.replace(twin, harmless=False))):
+        assert fitted(config, other) == other
 
 
 @pytest.mark.parametrize(("load_Nm", "fits"), [(9.59, True), (9.6, False)])

@@ -52,6 +52,8 @@ MOTION = frozenset(
         Fault.TORQUE_SATURATED, Fault.LIMIT_CYCLE, Fault.STOP_TIMEOUT,
     }
 )  # fmt: skip
+# of a reading that is false: where there are two encoders, the other one contradicts it
+READING = MOTION | {Fault.POSITION_DISAGREEMENT}
 # what a joint that seems to move, or does, shows before it is enabled
 NOT_STARTED = frozenset({Fault.NOT_AT_STANDSTILL, Fault.MOVED_BEFORE_START})
 DRIVE = frozenset({Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED})
@@ -123,7 +125,7 @@ _CLASSES = (
         on_wire=True,
     ),
     FaultClass(
-        FaultKind.TPDO_DELAYED, Sizes((0.01, 5.0), (0.003, 0.05)), Sizes(_ALWAYS, (0.0001, 0.001)), MOTION | _STALE,
+        FaultKind.TPDO_DELAYED, Sizes((0.01, 5.0), (0.003, 0.05)), Sizes(_ALWAYS, (0.0001, 0.001)), READING | _STALE,
         on_wire=True,
     ),
     FaultClass(FaultKind.RPDO_DUPLICATED, None, Sizes(_ALWAYS, (0.0, 1.0)), on_wire=True),
@@ -133,12 +135,12 @@ _CLASSES = (
     ),
     FaultClass(
         # before enabling, settle_s of good samples in a row are asked for
-        FaultKind.TPDO_REORDERED, Sizes(_ALWAYS, (0.3, 1.0)), Sizes(_ALWAYS, (0.0, 0.05)), MOTION, on_wire=True
+        FaultKind.TPDO_REORDERED, Sizes(_ALWAYS, (0.3, 1.0)), Sizes(_ALWAYS, (0.0, 0.05)), READING, on_wire=True
     ),
     FaultClass(FaultKind.RPDO_CORRUPTED, Sizes((0.0005, 0.003), (0.3, 1.0)), None, MOTION | DRIVE, on_wire=True),
     FaultClass(
         FaultKind.TPDO_CORRUPTED, Sizes((0.0015, 0.05), (0.3, 1.0)), None,
-        MOTION | DRIVE | NOT_STARTED | {Fault.DRIVE_STAYS_ENABLED}, on_wire=True,
+        READING | DRIVE | NOT_STARTED | {Fault.DRIVE_STAYS_ENABLED}, on_wire=True,
     ),
     FaultClass(
         FaultKind.RPDO_LENGTH, Sizes((0.06, LONG_s), (0.0, 3.99)), Sizes((0.001, 0.01), (0.0, 8.99)),
@@ -156,17 +158,17 @@ _CLASSES = (
     FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s), (1.0, 1.0)), None, frozenset({Fault.DRIVE_FAULT}), True),
     FaultClass(
         FaultKind.ENCODER_STUCK, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)),
-        MOTION | NOT_STARTED,
+        READING | NOT_STARTED,
     ),
     FaultClass(
         FaultKind.ENCODER_JUMP, Sizes(_ALWAYS, (0.0205, 1.0)), Sizes(_ALWAYS, (0.00001, 0.0005)),
-        MOTION | NOT_STARTED, True,
+        READING | NOT_STARTED, True,
     ),
     FaultClass(
         FaultKind.ENCODER_DRIFT, Sizes(_ALWAYS, (0.05, 1.0)), Sizes((0.001, 1.0), (0.0001, 0.01)),
-        MOTION | NOT_STARTED | {Fault.REFERENCE_LIMIT},
+        READING | NOT_STARTED | {Fault.REFERENCE_LIMIT},
     ),
-    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION | NOT_STARTED),
+    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, READING | NOT_STARTED),
     FaultClass(
         FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION
     ),
@@ -452,13 +454,17 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
 
 
 def fitted(config: Config, scenario: Scenario) -> Scenario:
-    """The scenario with a harmless size that is harmless with this configuration's velocity filter.
+    """The scenario with a harmless size that is harmless with this configuration's velocity filter and encoders.
 
     A swapped sample reads as half the speed and the next one as twice that.  The filter of configs/virtual.toml lets
     any number of swaps pass for harmless; one that passes more reads two in a row as 1.8 times the speed, and 0.6 rad/s
     as more than the limit: there a harmless reordering is one swap.  So it is with a reading that stands still for two
-    samples and then leaps by three: there it stands still for one.
+    samples and then leaps by three: there it stands still for one.  A drift that one encoder has beside another one is
+    harmless within half of what the two may differ by.
     """
+    if scenario.kind is FaultKind.ENCODER_DRIFT and scenario.harmless and config.joint_encoder is not None:
+        longest_s = 0.5 * config.joint_encoder.disagreement_max_rad / abs(scenario.magnitude)
+        return replace(scenario, duration_s=min(scenario.duration_s, longest_s))
     if scenario.kind not in (FaultKind.TPDO_REORDERED, FaultKind.ENCODER_STUCK) or not scenario.harmless:
         return scenario
     period_s = 1.0 / config.loop.rate_Hz

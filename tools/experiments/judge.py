@@ -14,6 +14,8 @@ quick stop with what the load leaves of it:
 
     d = (F - ripple - L) / J,   x2 = v1^2 / (2 d)
 
+or by the drive's quick stop along 6085 where that is slower still: such a ramp holds the joint up against its friction.
+
 `t` is `REACTION_s` where the loop measures and the drive receives, or more where these take longer: one period each for
 sample and command, the velocity filter (three time constants, 5 ms at 100 Hz) and the motor's delay and lag.  Where the
 drive does not receive from the loop it holds the last torque, or in a sweep the last velocity, until its own watchdog
@@ -144,8 +146,10 @@ def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
     return config.joint.reduction_ratio * min(curves) * (1.0 - virtual.friction_ripple)
 
 
-def envelope(config: Config, scenario: Scenario, constants: AxisConstants) -> Envelope:
-    """See the module; `constants` is the AxisConstants record of the scenario."""
+def envelope(
+    config: Config, scenario: Scenario, constants: AxisConstants, quick_stop_radps2: float = math.inf
+) -> Envelope:
+    """See the module; `constants` is the AxisConstants record of the scenario, the quick stop that of the drive."""
     limits, kind = constants.limits, scenario.kind
     inertia = scenario.plant["inertia_kgm2"]
     ripple = sum(scenario.plant["torque_ripple_Nm"])
@@ -157,7 +161,7 @@ def envelope(config: Config, scenario: Scenario, constants: AxisConstants) -> En
     wait_s = reaction_s(config, kind)
     push = (drive_Nm + ripple + load + constant_Nm) / inertia
     speed = limits.velocity_max_radps + push * wait_s
-    brake = (min(floor, drive_Nm + floor - load) if load else floor) / inertia
+    brake = min((min(floor, drive_Nm + floor - load) if load else floor) / inertia, quick_stop_radps2)
     way = limits.velocity_max_radps * wait_s + 0.5 * push * wait_s**2 + speed**2 / (2.0 * brake)
     stop_s = wait_s + speed / brake + BRAKE_SPARE_s
     if load > floor:  # after power off it moves the joint for the rest of its time
@@ -492,7 +496,7 @@ def judge(config: Config, joint: LockstepJoint, scenario: Scenario, place: Place
     period_s = float(axis.law.period_s)
     period_ns = round(period_s * 1e9)
     start_ns = int(joint.start_ns)
-    allowed = envelope(config, scenario, axis)
+    allowed = envelope(config, scenario, axis, joint.quick_stop_radps2)
     fault_row = fault_row_of(run, start_ns, period_ns)
     by_position = int(axis.command_kind) == CommandKind.POSITION
     wrong, off_s = wrong_of_joint(run, allowed, scenario, fault_row, start_ns, period_ns, by_position=by_position)

@@ -189,23 +189,28 @@ def largest_peak_Nm(config: Config) -> float:
     return peak
 
 
-def config_of_response(config: Config, torque_Nm: float | None) -> Config:
-    """The configuration with the weak law and the torque that the user allows; the motor's encoder feeds the law."""
+def config_of_response(config: Config, torque_Nm: float | None, *, own_law: bool = False) -> Config:
+    """The configuration with the torque that the user allows, and the weak law, which the motor's encoder feeds.
+
+    `own_law` of the configuration instead, without learning: for a joint that is known to be too soft for the weak one.
+    """
     limits = config.limits
     if torque_Nm is not None and not 0.0 < torque_Nm <= limits.torque_max_Nm:
         raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
     known = config.friction is not None and config.control.feed_forward != "none"
-    law: dict[str, Any] = {
-        "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
-        "feed_forward": "desired" if known else "none", "learning": None, "adaptation": None,
-        "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
-    }  # fmt: skip
+    law: dict[str, Any] = {"learning": None, "adaptation": None, "feed_forward": "desired" if known else "none"}
+    if not own_law:
+        law |= {
+            "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
+            "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
+        }  # fmt: skip
     config = with_mode(config, "torque")
     update: dict[str, Any] = {"control": config.control.model_copy(update=law)}
     if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:
         update["limits"] = limits.model_copy(update={"torque_max_Nm": torque_Nm})
         update["drive"] = config.drive.free_of_torque_limit()
-    return motor_fed(config.model_copy(update=update))
+    config = config.model_copy(update=update)
+    return config if own_law else motor_fed(config)
 
 
 def motor_fed(config: Config) -> Config:

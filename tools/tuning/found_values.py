@@ -13,14 +13,16 @@ from typing import Any
 import tomlkit
 
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Reducer
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer
 from jointctl.tools.configuration.written_sections import document_of
+from jointctl.tools.tuning.excitation import SPEED_radps
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit
 
 MARK = "# tuned by jointctl: "
 SMALL_MOTION = 1.6  # stiffness of a small motion over that under a steady torque: hysteresis, 1.4 to 1.84
 CRITICAL_SHARE = 0.04  # of the critical damping: what is more is hysteresis, which a small motion does not have
 DIGITS = 5
+STANDS_radps, KNEE_radps = 1e-3, 0.4  # of a friction of which no curve is known: static below, constant beyond
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,6 @@ def _same_plant(before: Config, after: Config) -> Config:
 
 def with_friction(config: Config, section: Mapping[str, Any]) -> Config:
     """The configuration in use with the friction that was identified; what it knew of bristles stays."""
-    from jointctl.tools.configuration.sections import Friction
-
     lugre = config.friction.lugre if config.friction is not None else None
     return _same_plant(
         config, config.model_copy(update={"friction": Friction.model_validate({**section, "lugre": lugre})})
@@ -109,17 +109,38 @@ def with_break_away(config: Config, torque_Nm: float) -> Config:
 
     Nothing of it is fed forward.  A joint that is pushed harder and does not move has an encoder that stands still.
     """
-    from jointctl.tools.configuration.sections import Friction, FrictionDirection
-
-    side = FrictionDirection.model_validate(
-        {**dict.fromkeys(("tv", "a0", "a1", "a2", "a3"), 0.0), "tc_Nm": torque_Nm, "ts_Nm": torque_Nm, "ws": 1.0,
-         "knee": 1.0, "max": 1.0}
-    )  # fmt: skip
-    friction = Friction(
-        velocity_unit="rad/s", velocity_side="joint", torque_side="joint", positive=side,
-        negative=side.model_copy(update={"tc_Nm": -torque_Nm, "ts_Nm": -torque_Nm}),
-    )  # fmt: skip
+    friction = _straight(torque_Nm, (torque_Nm, torque_Nm), 0.0)
     return without_friction(config).model_copy(update={"friction": friction})
+
+
+def with_sliding(config: Config, torque_Nm: float, sliding_Nm: tuple[float, float], slope_Nmspr: float) -> Config:
+    """As `with_break_away`, and the friction of the response's legs is fed forward: a law that is soft needs it.
+
+    `sliding_Nm` at SPEED_radps, with its sign, `slope_Nmspr` there.  What is more at lower speeds is not known yet, and
+    beyond KNEE_radps nothing is added.
+    """
+    sizes = max(sliding_Nm[0], 0.0), max(-sliding_Nm[1], 0.0)  # a load may be more than the friction
+    slope_Nmspr = min(max(slope_Nmspr, 0.0), 0.5 * min(sizes) / SPEED_radps)
+    coulomb = (sizes[0] - SPEED_radps * slope_Nmspr, sizes[1] - SPEED_radps * slope_Nmspr)
+    friction = _straight(torque_Nm, coulomb, slope_Nmspr)
+    before = with_break_away(config, torque_Nm)
+    control = before.control.model_copy(update={"feed_forward": "desired"})
+    return before.model_copy(update={"friction": friction, "control": control})
+
+
+def _straight(static_Nm: float, coulomb_Nm: tuple[float, float], slope_Nmspr: float) -> Friction:
+    """Coulomb and viscous friction of either direction, at the joint; the static one counts at standstill alone."""
+
+    def side(sign: float, coulomb: float) -> FrictionDirection:
+        return FrictionDirection(
+            tc_Nm=coulomb, ts_Nm=max(static_Nm, coulomb), ws=STANDS_radps, tv=slope_Nmspr,
+            a0=sign * (coulomb + KNEE_radps * slope_Nmspr), a1=0.0, a2=0.0, a3=0.0, knee=sign * KNEE_radps, max=sign,
+        )  # fmt: skip
+
+    positive, negative = side(1.0, coulomb_Nm[0]), side(-1.0, coulomb_Nm[1])
+    return Friction(
+        velocity_unit="rad/s", velocity_side="joint", torque_side="joint", positive=positive, negative=negative
+    )
 
 
 def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]]) -> str:

@@ -2,12 +2,14 @@
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
                                                             and lag at the late end, link at both ends of the payload
-    phase margin >= margin.min_phase_margin_deg             every joint of the gate of `run`
+    phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, and one as stiff as under
+    |S| <= margin.max_sensitivity of a soft joint           a steady torque, which no hysteresis holds
     torque noise of the encoders' counts <= a share of limits.torque_max_Nm
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / RIPPLE_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
-filter, then Nelder and Mead from its best points; kp follows from kv.  By this error a quick observer and a stiff loop
+filter, then Nelder and Mead from its best points; kp follows from kv.  A joint that is late beside its resonance bears
+two to seven times the kv behind a filter far below that.  By this error a quick observer and a stiff loop
 look alike; on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit.  A
 goal that is missed costs in proportion, so that the result of a joint that does not allow all of them is the nearest
 one, and says so.
@@ -56,12 +58,16 @@ UNSTABLE = 1e3
 LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
 LEAST_STIFFNESS_SHARE = 0.1
 LEAST_LATE_s = 0.1e-3
+GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
+TWO_ENCODERS = "[joint_encoder] beside an encoder on the motor"
+SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 LEARNING_FACTOR = 0.9  # of a repetition, at most
 _LOWEST_Hz, _POINTS = 0.3, 240
-_GRID, _STARTS, _EVALUATIONS = 6, 2, 90
+_NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
+_STARTS, _EVALUATIONS = 2, 90
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class Law:
     name: str
     control: Callable[[], Control]
     keys: tuple[str, ...]  # of LoopSettings, positive
-    spans: tuple[tuple[float, float], ...]  # of each key
+    spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
     kp_of_kv: float
 
     most_observer_radps: float = math.inf
@@ -100,28 +106,30 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0), (6.0, 45.0), (80.0, 450.0)), 0.25, QUICKEST_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps,
     ),
     "paper": Law(
-        "paper", paper_control, ("kv", "q"), ((12.0, 120.0), (60.0, 6000.0)), 0.25,
+        "paper", paper_control, ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
     "two_encoders": Law(
-        "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps"),
-        ((4.0, 60.0), (12.0, 110.0)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
+        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
     ),
 }  # fmt: skip
 
 
+def has_both_encoders(config: Config) -> bool:
+    """One on the motor, which [encoder] describes, and one behind the reducer."""
+    return config.joint_encoder is not None and config.encoder.side == "motor"
+
+
 def chosen_law(config: Config, fit: JointFit, wanted: str) -> Law:
     """`wanted` "auto": both encoders where the reducer is soft and there are two, else the precise one."""
-    both = config.joint_encoder is not None and config.encoder.side == "motor"
+    both = has_both_encoders(config)
     if wanted == "auto":
         wanted = "two_encoders" if fit.flexible and both else "precise"
     if wanted == "two_encoders" and not (fit.flexible and both):
-        raise ConfigurationError(
-            f"{config.path}: --law (=two_encoders) needs [joint_encoder] beside an encoder on the motor, and a joint "
-            "whose reducer is seen to be soft"
-        )
+        raise ConfigurationError(f"--law (=two_encoders) needs {TWO_ENCODERS}, and a reducer that is seen to be soft")
     return LAWS[wanted]
 
 
@@ -136,6 +144,7 @@ class Judged:
     sensitivity: float
     noise_Nm: float
     gate_deg: float  # least phase margin of the joints of the gate
+    gate_sensitivity: float  # and their largest |S|
     settling_s: float  # slowest mode of the joint as it is believed
 
     @property
@@ -147,6 +156,7 @@ class Judged:
 class Goals:
     noise_Nm: float
     gate_deg: float
+    gate_sensitivity: float
 
     def missed(self, one: Judged) -> dict[str, float]:
         """By what share each goal is missed; empty if none is."""
@@ -158,6 +168,8 @@ class Goals:
             f"torque noise {one.noise_Nm:.2f} Nm, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
             f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:g} deg":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
+            f"|S| of the gate {one.gate_sensitivity:.2f}, {self.gate_sensitivity:.3g} at most":
+                one.gate_sensitivity / self.gate_sensitivity - 1.0,
         }  # fmt: skip
         return {name: share for name, share in shares.items() if share > 1e-3}
 
@@ -209,6 +221,15 @@ def identified_joints(config: Config, fit: JointFit) -> list[float | TwoMasses]:
     return list(found)
 
 
+def steady_joints(config: Config) -> list[TwoMasses]:
+    """As stiff as under a steady torque, at both ends of the payload: hysteresis adds nothing to a large motion."""
+    reducer = config.reducer
+    if reducer is None or reducer.loop_stiffness_Nmprad is None:
+        return []
+    softer = min(max(reducer.stiffness_Nmprad / reducer.loop_stiffness_Nmprad, SOFTEST), 1.0)  # it may be a guess
+    return [two_masses(config, reducer, payload, softer, False) for payload in config.margin.payload_range]
+
+
 def _payload_given(config: Config) -> bool:
     """Whether the file names a payload: the automatic range is that of a link behind a soft reducer."""
     return "payload_range" in config.margin.model_fields_set
@@ -219,7 +240,7 @@ class _Search:
         self.law, self.nominal = law, settings
         self.tried: list[Judged] = []
         period_s = self.nominal.period_s
-        self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / period_s, _POINTS)
+        self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
         late_s = settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
@@ -229,6 +250,10 @@ class _Search:
         ]
         self._of_goals = len(self._joints)
         self._joints += [linear_loop(case).joint for case in cases(settings)]
+        self._joints += [
+            sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders)
+            for joint in steady_joints(config)
+        ]
         self._responses = [joint.response(self._z) for joint in self._joints]
         counts = [law_resolution_rad(config), abs(joint_rad_per_count(config))]
         two = self.nominal.encoders == Encoders.BOTH
@@ -248,7 +273,7 @@ class _Search:
         for number, (joint, response) in enumerate(zip(self._joints, self._responses, strict=True)):
             radius = float(np.max(np.abs(LinearLoop(settings, joint, controller).closed_loop_poles())))
             if radius >= 1.0:
-                return Judged(settings, UNSTABLE * radius, 0.0, 1.0, UNSTABLE, 0.0, 0.0, math.inf)
+                return Judged(settings, UNSTABLE * radius, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
             settling = -settings.period_s / math.log(radius) if number == 0 else settling
             margins.append(_margins(-(law @ response)[:, 0, 0]))
         response = self._responses[0]
@@ -256,11 +281,23 @@ class _Search:
         error = response[:, 0, 0] * sensitivity * np.hypot(1.0 / self._omega, 1.0 / RIPPLE_radps)
         noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
         phases, gains, peaks = zip(*margins[: self._of_goals], strict=True)
+        gate = margins[self._of_goals :]
         return Judged(
             settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)), min(phases), min(gains), max(peaks),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
-            min((phase for phase, _, _ in margins[self._of_goals :]), default=90.0), settling,
+            min((phase for phase, _, _ in gate), default=90.0), max((peak for _, _, peak in gate), default=1.0),
+            settling,
         )  # fmt: skip
+
+
+def _frequencies_radps(config: Config, period_s: float) -> Array:
+    """Up to half the rate; closer about a resonance, whose peak is narrower than the other steps."""
+    highest = math.pi / period_s
+    omega: Array = np.geomspace(math.tau * _LOWEST_Hz, highest, _POINTS)
+    if config.reducer is None:
+        return omega
+    near = math.tau * two_masses(config, config.reducer, 1.0, 1.0, False).resonance_Hz * np.geomspace(*_NEAR)
+    return np.unique(np.concatenate((omega, near[near < highest])))
 
 
 def _margins(open_loop: ComplexArray) -> tuple[float, float, float]:
@@ -285,7 +322,9 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     control = _control(config, law.control())
     ready = config.model_copy(update={"control": control})
     settings, _ = loop_settings(ready)
-    goals = Goals(NOISE_SHARE * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg)
+    goals = Goals(
+        NOISE_SHARE * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s
+    )
     search = _Search(ready, law, fit, settings)
 
     def cost(one: Judged, least_error: float | None) -> float:
@@ -302,7 +341,7 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
 
     def best_of(least_error: float | None) -> Judged:
         if not search.tried:
-            for point in product(*(np.geomspace(low, high, _GRID) for low, high in law.spans)):
+            for point in product(*(np.geomspace(*span) for span in law.spans)):
                 search.judged(np.log(point))
         for start in sorted(search.tried, key=lambda one: cost(one, least_error))[:_STARTS]:
             x = law.logarithms(start.settings)

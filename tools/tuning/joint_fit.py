@@ -270,6 +270,7 @@ class Gravity:
     torque_Nm: float
     half_Nm: float
     zero_rad: float
+    sliding_Nm: tuple[float, float]  # friction of the positive and of the negative direction, with its sign
 
     @property
     def found(self) -> bool:
@@ -300,9 +301,10 @@ def gravity_of(plan: ResponsePlan, records: Any, period_s: float, zero_rad: floa
     both, spread = _fitted(np.column_stack((constant, np.sin(angle), np.cos(angle))), np.array(torque))
     if abs(both[3]) > SURE * spread[3]:
         size = math.hypot(both[2], both[3])
-        return Gravity(size, 2.0 * float(np.max(spread[2:])), zero_rad + math.atan2(-both[3], both[2]))
+        zero_rad += math.atan2(-both[3], both[2])
+        return Gravity(size, 2.0 * float(np.max(spread[2:])), zero_rad, (float(both[0]), float(both[1])))
     one, spread = _fitted(np.column_stack((constant, np.sin(angle))), np.array(torque))
-    return Gravity(float(one[2]), 2.0 * float(spread[2]), zero_rad)
+    return Gravity(float(one[2]), 2.0 * float(spread[2]), zero_rad, (float(one[0]), float(one[1])))
 
 
 def _fitted(columns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

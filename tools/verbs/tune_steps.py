@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError, JointctlError, MarginError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -51,12 +51,13 @@ from jointctl.tools.tuning.found_values import (
     values_of_fit,
     with_break_away,
     with_friction,
+    with_sliding,
     with_tuned,
     with_values,
     without_friction,
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, from_dict
-from jointctl.tools.tuning.gains import ChosenGains, choose_gains
+from jointctl.tools.tuning.gains import TWO_ENCODERS, ChosenGains, choose_gains, has_both_encoders
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
 from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
@@ -99,6 +100,8 @@ class Tune:
     def __post_init__(self) -> None:
         limits, torque_Nm = self.original.limits, self.options.torque_Nm
         self.config = self.original
+        if self.options.law == "two_encoders" and not has_both_encoders(self.original):
+            raise ConfigurationError(f"{self.original.path}: --law (=two_encoders) needs {TWO_ENCODERS}")
         if torque_Nm is not None:
             if not 0.0 < torque_Nm <= limits.torque_max_Nm:
                 raise UsageError(
@@ -238,6 +241,15 @@ class Tune:
         numbers = [finding["numbers"].get("break_away_Nm", 0.0) for finding in self.state["direction"]]
         return with_break_away(self.config, max(numbers)) if max(numbers) > 0.0 else without_friction(self.config)
 
+    def _sliding(self) -> Config:
+        """With what the legs of the response say of the friction: at low speed a soft law sticks without it."""
+        config, kept = self._before_friction(), self.state["response"]["gravity"]
+        static_Nm = static_friction_Nm(config)
+        if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
+            return config
+        positive_Nm, negative_Nm = kept["sliding_Nm"]
+        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value)
+
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
         self.config = with_values(self.config, self._fitted())
@@ -309,7 +321,7 @@ class Tune:
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
         options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
-        command = Sweep(self._before_friction(), self.carrier.quietly(), path, options)
+        command = Sweep(self._sliding(), self.carrier.quietly(), path, options)
         command.control = control = self.carrier.control
         try:
             ended = command.run()

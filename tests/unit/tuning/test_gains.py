@@ -13,7 +13,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.tuning.found_values import MARK, Found, values_of_fit, with_tuned, with_values
-from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains
+from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains, steady_joints
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
@@ -70,6 +70,29 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     judged = margins(loop_settings(changed(config, control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert found.best.settings.observer_radps < 120.0
+
+
+def test_a_joint_that_is_late_beside_its_resonance_gets_a_low_filter_and_passes_the_gate() -> None:
+    """A light motor, a heavy link and 2.8 ms: kv was 5 behind a filter of 450 Hz, which friction made stick."""
+    fit = fit_of(1.79, 2.85e-3, 1.36, 5.7e4)
+    config = known(shipped("realistic", reducer__stiffness_Nmprad=3.6e4), fit)
+    found = choose_gains(config, fit)
+    assert found.missed == {}
+    assert found.control.velocity_cutoff_Hz < 40.0
+    assert found.control.kv > 10.0
+    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
+    assert judged.sensitivity_peak <= config.margin.max_sensitivity
+
+
+def test_the_gate_counts_a_joint_without_hysteresis_but_never_one_softer_than_that() -> None:
+    config = known(shipped("realistic"), fit_of(2.1, 1.8e-3, 1.1, 2.6e4))
+    assert config.reducer is not None
+    for given, stiffness in ((1.3e4, 1.3e4), (1.8e4, 1.8e4), (0.4e4, 1.3e4), (9e4, 2.6e4)):
+        reducer = config.reducer.model_copy(update={"stiffness_Nmprad": given})
+        found = steady_joints(config.model_copy(update={"reducer": reducer}))
+        assert [joint.stiffness_Nmprad for joint in found] == pytest.approx([stiffness] * 2)
+    assert steady_joints(known(shipped("precise"), fit_of(2.0, 1.5e-3))) == []
 
 
 def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing() -> None:

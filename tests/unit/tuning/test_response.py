@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.friction import friction_curve_Nm
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
-from jointctl.tools.configuration.conversions import static_friction_Nm
+from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.tuning.carry_out import response_task
 from jointctl.tools.tuning.excitation import (
     ResponsePlan,
     config_of_response,
@@ -27,9 +29,10 @@ from jointctl.tools.tuning.excitation import (
     room_rad,
     speed_and_period,
 )
-from jointctl.tools.tuning.found_values import with_break_away, without_friction
+from jointctl.tools.tuning.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
 from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, fitted_again, gravity_of
+from jointctl.tools.tuning.tune_options import ResponseOptions
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
 
@@ -248,3 +251,37 @@ def test_before_the_friction_is_known_the_reading_is_watched_by_what_moved_the_j
     assert moving.control.feed_forward == "none"
     assert config_of_response(shipped("precise"), None).control.feed_forward == "desired"
     assert axis_constants(without_friction(config), np.zeros((2, 5)))[0].limits.frozen_torque_Nm == 0.0
+
+
+@pytest.mark.parametrize(
+    ("sliding_Nm", "slope_Nmspr", "at_radps", "fed_Nm"),
+    [
+        ((17.0, -18.0), 16.0, (0.2, -0.2, 0.1, 0.4, 5.0, -5.0), (17.0, -18.0, 15.4, 20.2, 20.2, -21.2)),
+        ((17.0, -18.0), -3.0, (0.2, -0.2, 5.0), (17.0, -18.0, 17.0)),  # a slope that falls is none
+        ((4.0, -18.0), 16.0, (0.2, 0.02), (4.0, 2.2)),  # half of the friction at most is viscous
+        ((30.0, 5.0), 16.0, (0.2, -0.2), (30.0, 0.0)),  # a load beyond the friction pushes in one direction alone
+    ],
+)
+def test_after_the_response_its_friction_is_fed_forward_and_no_more(
+    sliding_Nm: tuple[float, float], slope_Nmspr: float, at_radps: tuple[float, ...], fed_Nm: tuple[float, ...]
+) -> None:
+    config = with_sliding(shipped("precise"), 20.0, sliding_Nm, slope_Nmspr)
+    assert config.friction is not None
+    assert config.control.feed_forward == "desired"
+    curve = friction_curve_Nm(friction_constants(config.friction, 121.0), np.array(at_radps))
+    assert 121.0 * curve == pytest.approx(fed_Nm, abs=1e-6)
+    assert axis_constants(config, np.zeros((2, 5)))[0].limits.frozen_torque_Nm >= 30.0
+    assert plant_settings(config) == plant_settings(shipped("precise"))
+
+
+def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own() -> None:
+    soft = shipped(
+        "realistic", reducer__loop_stiffness_Nmprad=5.7e4, reducer__motor_inertia_kgm2=0.43, control__kp=49.0,
+        control__kv=5.7, margin__loop_delay_s=1.9e-3, margin__current_lag_s=0.95e-3,
+    )  # fmt: skip
+    own = response_task(soft, ResponseOptions()).config
+    assert own.control.kind == "flexible_joint"
+    assert (own.control.kp, own.control.kv, own.control.learning) == (49.0, 5.7, None)
+    weak = response_task(shipped("realistic"), ResponseOptions()).config  # the twin
+    assert weak.control.kind == "computed_torque_observer"
+    assert weak.control.kv == 20.0
