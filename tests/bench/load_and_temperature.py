@@ -13,10 +13,13 @@ have neither ripple nor coarse encoders: what is left there is the friction mode
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it; before numpy
 
 import numpy as np
 
