@@ -347,9 +347,7 @@ def _worth(term: str, model: Model, vector: np.ndarray, problem: _Problem) -> bo
     return float(left @ left) > _WORTH**2 * after
 
 
-def _moves(
-    model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem, *, placed: bool
-) -> dict[str, Model]:
+def _moves(model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem, *, placed: bool) -> dict[str, Model]:
     """Models with one term more than `model`; `placed`: with friction that goes with the joint's angle."""
     found = {}
     for name in FORM_STEPS[model.form.name]:
