@@ -87,7 +87,8 @@ class TableFile:
         cells = [split(line, self.mark)[index] for line in self.lines]
         if not cells or not _TIMESTAMP.fullmatch(cells[0]):
             return None
-        texts, zones = [], {}
+        texts: list[str] = []
+        zones: dict[str | None, str] = {}
         for line, cell in zip(self.numbered, cells, strict=True):
             found = _TIMESTAMP.fullmatch(cell)
             zone = found[3] if found else None
