@@ -139,7 +139,7 @@ def prediction_figure(found: MotionFit) -> Any:
     windows = _windows(found)
     with canvas(6.4, f"{motion.path.name}: predicted on held-out blocks") as figure:
         names = [f"window {number}" for number in range(max(1, len(windows)))]
-        axes = figure.subplot_mosaic([names, ["error"] * len(names)], height_ratios=(3, 2))
+        axes = figure.subplot_mosaic([[*names], ["error"] * len(names)], height_ratios=(3, 2))
         lower = axes["error"]
         style: dict[str, Any] = {}
         if motion.plateaus:
