@@ -1,22 +1,27 @@
 """What friction by load and temperature buys, as it is identified: random simulated joints without learning.
 
-    python -m tests.bench.load_and_temperature [joints] [seed] [quiet joints]
+    python -m tests.bench.load_and_temperature [joints] [seed] [quiet joints] [folder]
 
 Each joint carries a pendulum of 20 Nm; how its friction goes with load and temperature is drawn at random.  It is moved
 as `excite` does, cold (15 to 20 degC) and warm (45 to 50 degC), and both logs go through `identify`.  At a temperature
-of its own, 15 to 55 degC, `precise`, as it is and with `observer_paired`, then believes the curve of 25 degC without
-load (today's model), the section that was identified, or the truth.  Errors: RMSE of the friction feed-forward against
-the true friction, and of the joint itself, in the first period of a motion that is not one of those.  `quiet` joints
-have neither ripple nor coarse encoders: what is left there is the friction model's.  Then one joint warms up from 20 to
-50 degC while it moves.  All of it is simulated.
+of its own, 15 to 55 degC, each law then believes the curve of 25 degC without load (today's model), the section that
+was identified, or the truth.  The laws are `precise`, as it is and with `observer_paired`, with a slow observer, and
+without one at its own gains and at those of the paper.  Errors: RMSE of the friction feed-forward against the true
+friction, and of the joint itself, in the first period of a motion that is not one of those.  `quiet` joints have
+neither ripple nor coarse encoders: what is left there is the friction model's.  Then one joint warms up from 20 to
+50 degC while it moves.  What was identified is kept in `folder`, so that a run that was cut off goes on there.  All of
+it is simulated.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it; before numpy
 
 import numpy as np
 
@@ -42,7 +47,15 @@ PERIOD_s = 10.0
 COLD_degC, WARM_degC = (15.0, 20.0), (45.0, 50.0)
 MOTION_s = 60.0
 MODELS = ("today's model", "identified", "true")
-LAWS = {"as it is": False, "observer_paired": True}
+LAWS: dict[str, dict[str, Any]] = {  # changes of [control]
+    "precise": {},
+    "precise, observer_paired": {"observer_paired": True},
+    "observer of 10 rad/s": {"observer_radps": 10.0},
+    "no observer": {"kind": "computed_torque", "observer_radps": 0.0},
+    "no observer, the paper's kp 784, kv 56": {
+        "kind": "computed_torque", "observer_radps": 0.0, "kp": 784.0, "kv": 56.0,
+    },
+}  # fmt: skip
 QUIET = EnsembleSettings(
     friction_scale=(0.98, 1.02), torque_ripple_Nm=(0.0, 0.0), friction_ripple=(0.0, 0.0), encoder_bits=(24, 24)
 )
@@ -103,13 +116,19 @@ def excited(config: Config, design: Design, degC: float, folder: Path) -> Path:
     return path
 
 
-def identified(config: Config, design: Design, random: np.random.Generator) -> Friction:
-    """What `identify` makes of a cold and a warm log."""
+def identified(config: Config, design: Design, random: np.random.Generator, kept: Path | None = None) -> Friction:
+    """What `identify` makes of a cold and a warm log; `kept`: the file that has it already, or is to get it."""
+    ends_degC = [random.uniform(*ends) for ends in (COLD_degC, WARM_degC)]
+    if kept is not None and kept.exists():
+        return Friction.model_validate_json(kept.read_text())
     with TemporaryDirectory() as name:
-        cold, warm = (excited(config, design, random.uniform(*ends), Path(name)) for ends in (COLD_degC, WARM_degC))
+        cold, warm = (excited(config, design, degC, Path(name)) for degC in ends_degC)
         settings = MotionSettings(speed_min_radps=0.8 * design.slowest_radps, also=(warm,))
         found = identify_motion(motion_from(cold, ForeignFormat(), settings), settings)
-    return Friction.model_validate(motion_section(found))
+    friction = Friction.model_validate(motion_section(found))
+    if kept is not None:
+        kept.write_text(friction.model_dump_json())
+    return friction
 
 
 def errors(run: LockstepRun, after_s: float, before_s: float) -> tuple[float, float]:
@@ -122,19 +141,19 @@ def errors(run: LockstepRun, after_s: float, before_s: float) -> tuple[float, fl
     return float(np.sqrt(np.mean(friction_Nm**2))), float(np.sqrt(np.mean(error_mrad**2)))
 
 
-def random_joint(seed: int, index: int, design: Design, *, quiet: bool) -> np.ndarray:
+def random_joint(seed: int, index: int, design: Design, *, quiet: bool, kept: Path | None = None) -> np.ndarray:
     """(laws, 3 models, 2 errors) of the first period of one joint."""
     settings = QUIET if quiet else EnsembleSettings(friction_scale=(0.98, 1.02))
     random = np.random.default_rng([seed, index, 1])
     config, truth = true_terms(random_plant(base_config(), settings, seed, index), random)
-    found = identified(config, design, random)
+    found = identified(config, design, random, kept)
     assert config.virtual is not None
     virtual = config.virtual.model_copy(update={"ambient_degC": float(random.uniform(15.0, 55.0))})
     config = config.model_copy(update={"virtual": virtual})
     rows = []
-    for paired in LAWS.values():
+    for changes in LAWS.values():
         for believed in (config, believing(config, found), believing(config, truth)):
-            control = believed.control.model_copy(update={"observer_paired": paired})
+            control = believed.control.model_copy(update=changes)
             run = LockstepJoint(believed.model_copy(update={"control": control})).run()
             rows.append(errors(run, 0.0, PERIOD_s) if not run.fault else (np.inf, np.inf))
     return np.array(rows).reshape(len(LAWS), len(MODELS), 2)
@@ -174,15 +193,18 @@ def _print_law(found: np.ndarray) -> None:
         )
 
 
-def main(joints: int = 40, seed: int = 90311, quiet_joints: int = 10) -> None:
+def main(joints: int = 40, seed: int = 90311, quiet_joints: int = 10, folder: Path | None = None) -> None:
     design = designed(config_of_sweep(base_config(), "torque"), MOTION_s, 1)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     for quiet, count in ((False, joints), (True, quiet_joints)):
+        kind = "quiet" if quiet else "realistic"
         rows = []
         for index in range(count):
-            rows.append(random_joint(seed, index, design, quiet=quiet))
+            kept = None if folder is None else folder / f"{seed}_{kind}_{index}.json"
+            rows.append(random_joint(seed, index, design, quiet=quiet, kept=kept))
             print(f"{index}: {np.round(rows[-1], 4).tolist()}", file=sys.stderr, flush=True)
         found = np.array(rows)
-        kind = "quiet" if quiet else "realistic"
         for law, title in enumerate(LAWS):
             print(f"{count} {kind} joints, seed {seed}, simulated, {title}; medians (5..95 %) of the first period")
             _print_law(found[:, law])
@@ -191,4 +213,4 @@ def main(joints: int = 40, seed: int = 90311, quiet_joints: int = 10) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(*map(int, sys.argv[1:4]), *map(Path, sys.argv[4:5]))

@@ -150,6 +150,13 @@ VELOCITY_UNITS = {**RADPS_PER_UNIT, "turn/s": math.tau, "count/s": math.nan}
 Nm_PER_UNIT = {"Nm": 1.0, "Ncm": 1e-2, "mNm": 1e-3}
 A_PER_UNIT = {"A": 1.0, "mA": 1e-3}
 DEGC_OF_UNIT = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)}
+_UNIT_NAMES = {  # how else headings write a unit, in lower case
+    "°": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "radian": "rad", "radians": "rad", "°/s": "deg/s",
+    "deg/sec": "deg/s", "dps": "deg/s", "rad/sec": "rad/s", "rpm": "r/min", "1/min": "r/min", "u/min": "r/min",
+    "min^-1": "r/min", "rev/min": "r/min", "turns": "turn", "rev": "turn", "counts": "count", "sec": "s",
+    "seconds": "s", "µs": "us", "n·m": "Nm", "n*m": "Nm", "n m": "Nm", "n.m": "Nm", "nm": "Nm", "mnm": "mNm",
+    "ncm": "Ncm", "a": "A", "ma": "mA", "°c": "degC", "c": "degC", "k": "K", "°f": "degF",
+}  # fmt: skip
 REVERSIBLE = ("position", "velocity", "torque", "load")
 
 
@@ -247,6 +254,25 @@ def require_stated(table: TableFile, given: ForeignFormat, needed: Sequence[tupl
         raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
 
 
+def require_units_of_heading(table: TableFile, given: ForeignFormat) -> None:
+    """`DataError` where a unit in brackets behind a column's name is known and another one was given."""
+    for flag, column, unit, known in (
+        ("--time-unit", given.time_column, given.time_unit, SECONDS_PER_UNIT),
+        ("--position-unit", given.position_column, given.position_unit, RAD_PER_UNIT),
+        ("--velocity-unit", given.velocity_column, given.velocity_unit, VELOCITY_UNITS),
+        ("--torque-unit", given.torque_column, given.torque_unit, Nm_PER_UNIT),
+        ("--current-unit", given.current_column, given.current_unit, A_PER_UNIT),
+        ("--temperature-unit", given.temperature_column, given.temperature_unit, DEGC_OF_UNIT),
+    ):
+        stated = table.unit(column) if column else ""
+        written = _UNIT_NAMES.get(stated.lower(), stated)
+        if written in known and unit is not None and written != unit:
+            raise DataError(
+                f"{table.path}: {column}: its heading has {stated}, but {flag} (={unit}) says otherwise",
+                f"{flag} {written}, or correct the heading",
+            )
+
+
 def chosen_lines(table: TableFile, given: ForeignFormat) -> TableFile:
     """The lines for which each COLUMN=VALUE of `--where` holds, as text or as a number."""
     for rule in given.where:
@@ -297,6 +323,7 @@ def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
         raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
     stated = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
     require_stated(table, given, stated)
+    require_units_of_heading(table, given)
     assert given.ratio is not None
     table = chosen_lines(table, given)
     velocity, torque = velocity_radps(table, given), motor_torque_Nm(table, given)

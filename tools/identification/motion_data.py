@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from scipy.signal import butter, sosfiltfilt
 
 from jointctl.drivers.errors import DataError, UsageError
@@ -44,6 +44,11 @@ _SAME_RATE = 0.01
 _TOP_SPEED_radps, _DIRECT = 100.0, 2.0  # of a joint behind a reducer; with a ratio below it is that of a motor
 _DIRECT_SPEED_radps = 1000.0
 _MOST_rad = 4.0 * math.pi  # of a joint: farther gets a note
+_NEIGHBOURS = 5  # samples whose median a sample is compared with
+_WILD_SHARES = {"position": 0.05, "velocity": 0.5, "torque": 1.0}  # of a column's range: farther off it is no motion
+_WILD = 12.0  # times the usual distance from the median
+_EVEN = 0.6  # of the usual step: of a clock that was set or of several motions some are shorter
+_MOST_OF_LOAD = 3.0  # times the known load a torque may go
 _LEVELS = 4.0  # times as often as the value before it a limit is reached; the end of a coarse range is not
 _SIDE_TOLERANCE = 0.5  # of the logarithm of a factor that is near the ratio
 
@@ -135,6 +140,8 @@ class RawMotion:
                    "torque": self.torque_Nm, "load": self.load_Nm}  # fmt: skip
         for name, values in columns.items():
             missing = np.zeros(len(known), bool) if values is None else ~np.isfinite(values)
+            if missing.all():
+                raise self.problem(name, "has no value")
             if missing.any():
                 self.notes.append(f"{self.names[name]}: {np.count_nonzero(missing)} samples without a value: left out")
             known &= ~missing
@@ -143,8 +150,46 @@ class RawMotion:
         warm = self.temperature_degC
         if warm is not None and not np.isfinite(warm).all():
             there = np.isfinite(warm)
-            self.notes.append(f"{self.names['temperature']}: {np.count_nonzero(there)} readings: followed in between")
+            seen = (
+                f"{np.count_nonzero(there)} readings: followed in between" if there.any() else "has no value: not used"
+            )
+            self.notes.append(f"{self.names['temperature']}: {seen}")
             self.temperature_degC = np.interp(self.time_s, self.time_s[there], warm[there]) if there.any() else None
+
+    def keep_near(self) -> None:
+        """Leave out samples that jump off and back, as a lost message or a value that stands for none does."""
+        kept = np.ones(len(self.time_s), bool)
+        columns = {"position": self.position_rad, "velocity": self.velocity_radps, "torque": self.torque_Nm}
+        for name, share in _WILD_SHARES.items():
+            values = columns[name]
+            if values is None or len(values) < LEAST_SAMPLES:
+                continue
+            near = median_filter(values, _NEIGHBOURS, mode="nearest")
+            off = np.abs(values - near)
+            usual = 1.4826 * float(np.median(off[off > 0.0])) if off.any() else 0.0
+            wild = off > max(share * float(np.ptp(near)), _WILD * usual)
+            if wild.any():
+                self.notes.append(
+                    f"{self.names[name]}: {np.count_nonzero(wild)} samples far off their neighbours: left out"
+                )
+            kept &= ~wild
+        if not kept.all():
+            self.keep(kept)
+
+    def in_order(self) -> None:
+        """Lines that stand twice are left out; lines out of order are sorted, where their times are an even clock's."""
+        same = np.append(False, np.diff(self.time_s) == 0.0)
+        for values in (self.position_rad, self.velocity_radps, self.torque_Nm):
+            same[1:] &= True if values is None else np.diff(values) == 0.0
+        order = np.argsort(self.time_s, kind="stable")
+        steps = np.diff(self.time_s[order])
+        if np.any(np.diff(self.time_s) < 0.0) and len(steps) and steps.min() > _EVEN * np.median(steps):
+            moved = np.count_nonzero(order != np.arange(len(order)))
+            self.notes.append(f"{self.names['time']}: {moved} lines out of order: sorted")
+            self.keep(order)
+        elif same.any():
+            self.notes.append(f"{self.names['time']}: {np.count_nonzero(same)} lines that stand twice: left out")
+            self.keep(~same)
 
     def problem(self, which: str, seen: str, hint: str = "") -> DataError:
         return DataError(f"{self.path}: {self.names[which]}: {seen}", hint)
@@ -330,6 +375,8 @@ def _check_units(raw: RawMotion, position: np.ndarray, velocity: np.ndarray, slo
     moving = np.abs(slope) > 0.1 * np.max(np.abs(slope))
     if not moving.any() or float(np.ptp(position)) == 0.0:
         raise raw.problem("position", "does not move")
+    if float(np.ptp(velocity)) <= _SAME * float(np.max(np.abs(velocity))):
+        raise raw.problem("velocity", f"is {velocity[0]:.4g} rad/s throughout, {raw.names['position']} moves otherwise")
     factor = float(np.median(velocity[moving] / slope[moving]))
     if abs(factor - 1.0) <= _FACTOR_TOLERANCE:
         return
@@ -442,7 +489,8 @@ def filtered_motion(raw: RawMotion, settings: MotionSettings, step: float) -> Mo
         None if raw.temperature_degC is None else at_grid(raw.temperature_degC), ~near,
         maximum_filter1d(turns, 4 * margin + 1), raw.ratio,
         raw.names["torque"], raw.names.get("velocity") or raw.names["position"],
-        (*raw.notes, *_far(raw, position)), placed=raw.position_rad is not None, mounting=raw.mounting,
+        (*raw.notes, *_far(raw, position), *_constant_load(raw)),
+        placed=raw.position_rad is not None, mounting=raw.mounting,
     )  # fmt: skip
 
 
@@ -464,6 +512,13 @@ def _far(raw: RawMotion, position_rad: np.ndarray) -> list[str]:
         return []
     return [f"{raw.names['position']}: covers {span:.4g} rad of the joint, {span / math.tau:.3g} turns: is the unit "
             "another, or the side the motor's?"]  # fmt: skip
+
+
+def _constant_load(raw: RawMotion) -> list[str]:
+    """A line where the column of the load leaves nothing to gravity and tells nothing of load friction."""
+    if raw.load_Nm is None or raw.position_rad is None or float(np.ptp(raw.load_Nm)) > 0.0:
+        return []
+    return [f"{raw.names['load']}: is {raw.load_Nm[0]:.4g} Nm throughout: gravity is not looked for"]
 
 
 def require_motion(raw: RawMotion, motion: Motion, settings: MotionSettings) -> None:
@@ -489,9 +544,12 @@ def require_motion(raw: RawMotion, motion: Motion, settings: MotionSettings) -> 
             "torque", f"goes against {raw.names['load']} ({factor:.4g} times): the sign of one is the other way round",
             "--reverse load, or --reverse torque if it does not oppose the motion either",
         )  # fmt: skip
-    for wrong in (raw.ratio, 1.0 / raw.ratio):
-        if share > 0.5 and abs(np.log(abs(factor) / wrong)) < _SIDE_TOLERANCE:
-            raise raw.problem(
-                "torque", f"goes with {factor:.4g} times {raw.names['load']}, near the ratio (={raw.ratio:g}) or its "
-                "inverse: one of them is at the motor, the other at the joint",
-            )  # fmt: skip
+    if share <= 0.5 or 1.0 / _MOST_OF_LOAD < factor < _MOST_OF_LOAD:
+        return
+    near = any(abs(np.log(factor / wrong)) < _SIDE_TOLERANCE for wrong in (raw.ratio, 1.0 / raw.ratio))
+    why = f", near the ratio (={raw.ratio:g}) or its inverse: one of them is at the motor, the other at the joint"
+    raise raw.problem(
+        "torque", f"goes with {factor:.4g} times {raw.names['load']}"
+        + (why if near else f": must be in [{1.0 / _MOST_OF_LOAD:.2g}..{_MOST_OF_LOAD:g}]"),
+        "--torque-unit, --torque-side" + (", --torque-constant" if not near else ""),
+    )  # fmt: skip

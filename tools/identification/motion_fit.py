@@ -57,6 +57,7 @@ _WEAK = 0.5
 _SHARE_OF_RATE = 0.4
 _PERIODS, _JOINT_PERIODS = 2.0, 0.5  # of an order that the angle must cover
 _LEAST_SLOW = 0.2  # share of the samples at which an order is within the band
+_NEEDED = frozenset(("inertia", "gravity"))  # what is transmitted; load friction is a share of it
 _WORTH = 1.003  # by which a linear fit to what is left must lower the error for an order to be tried
 
 
@@ -232,16 +233,21 @@ class _Problem:
 
 
 def _blocks(motion: Motion, used: np.ndarray, words: tuple[str, ...]) -> tuple[np.ndarray, int]:
-    """(block of each sample, number): as few as give both halves samples of each direction."""
+    """(block of each sample, number): as few as give both halves slow and fast samples of each direction."""
     count = len(motion.time_s)
     if motion.plateaus:  # a block is a speed, both ways; at random, so that each half has every speed somewhere
         blocks = -(-count // 2)
         return np.random.default_rng(0).permutation(blocks)[np.arange(count) // 2], blocks
+    parts = []
+    for word in words:
+        speed = SIGNS[word] * motion.velocity_radps
+        middle = np.median(speed[used & (speed > 0.0)])
+        parts += [used & (speed > middle), used & (speed > 0.0) & (speed <= middle)]
     blocks = BLOCKS
     while True:
         block = np.minimum(np.arange(count) * blocks // count, blocks - 1)
         odd = block % 2 == 1
-        shares = [np.mean(odd[used & (SIGNS[word] * motion.velocity_radps > 0.0)]) for word in words]
+        shares = [np.mean(odd[part]) for part in parts if part.any()]
         if all(_LEAST_SHARE <= share <= 1.0 - _LEAST_SHARE for share in shares) or 2 * blocks > MOST_BLOCKS:
             return block, blocks
         blocks *= 2
@@ -341,8 +347,8 @@ def _worth(term: str, model: Model, vector: np.ndarray, problem: _Problem) -> bo
     return float(left @ left) > _WORTH**2 * after
 
 
-def _moves(model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem) -> dict[str, Model]:
-    """Models with one term more than `model`."""
+def _moves(model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem, *, placed: bool) -> dict[str, Model]:
+    """Models with one term more than `model`; `placed`: with friction that goes with the joint's angle."""
     found = {}
     for name in FORM_STEPS[model.form.name]:
         beyond = np.abs(problem.samples.velocity_radps) > model.knee * model.top_radps
@@ -355,6 +361,8 @@ def _moves(model: Model, vector: np.ndarray, ground: _Ground, problem: _Problem)
             continue
         if term == "temperature-viscous" and not model.form.viscous:
             continue
+        if term.startswith("angle-j") and not placed:
+            continue
         if term.startswith(("ripple-", "angle-")) and not _worth(term, model, vector, problem):
             continue
         found[term] = replace(model, terms=model.terms | {term})
@@ -366,15 +374,22 @@ def _named(model: Model, vector: np.ndarray) -> dict[str, float]:
 
 
 def _choose(problem: _Problem, first: Model, ground: _Ground) -> tuple[Model, np.ndarray, list[Step]]:
-    """Term by term, by the held-out error."""
+    """Term by term, by the held-out error; then those go that others have made useless.
+
+    Friction that goes with the joint's angle comes last: gravity goes with the angle too, so that twice a turn it would
+    stand in for friction that goes with the load.
+    """
     model, vector = first, problem.fit(first, {})
     best_Nm = problem.held_out_Nm(model, _named(model, vector))
     steps = [Step("coulomb", best_Nm, True)]
+    placed = False
+    seen: dict[Model, float] = {}
     while True:
         start = _named(model, vector)
-        tried = {name: (candidate, problem.held_out_Nm(candidate, start))
-                 for name, candidate in _moves(model, vector, ground, problem).items()}  # fmt: skip
-        taken, left = None, dict(tried)
+        moves = _moves(model, vector, ground, problem, placed=placed)
+        new = {name: candidate for name, candidate in moves.items() if candidate not in seen}
+        seen.update({candidate: problem.held_out_Nm(candidate, start) for candidate in new.values()})
+        taken, left = None, {name: (candidate, seen[candidate]) for name, candidate in moves.items()}
         while left and taken is None:
             least_Nm = min(error for _, error in left.values())
             if least_Nm * GAIN >= best_Nm:
@@ -384,11 +399,31 @@ def _choose(problem: _Problem, first: Model, ground: _Ground) -> tuple[Model, np
             found = problem.fit(left[taken][0], start)
             if _drives(left.pop(taken)[0], found):
                 taken = None
-        steps += [Step(name, error, name == taken) for name, (_, error) in tried.items()]
+        steps += [Step(name, seen[moves[name]], name == taken) for name in moves if name in new or name == taken]
+        if taken is not None:
+            model, best_Nm, vector = moves[taken], seen[moves[taken]], found
+        elif placed:
+            return _without_useless(problem, model, vector, steps)
+        else:
+            placed = True
+
+
+def _without_useless(
+    problem: _Problem, model: Model, vector: np.ndarray, steps: list[Step]
+) -> tuple[Model, np.ndarray, list[Step]]:
+    """The model without the terms that no longer lower the held-out error by more than 1 %, the least useful first."""
+    best_Nm = min(step.held_out_rmse_Nm for step in steps if step.taken)
+    while True:
+        start = _named(model, vector)
+        fewer = {term: replace(model, terms=model.terms - {term}) for term in sorted(model.terms - _NEEDED)}
+        errors = {term: problem.held_out_Nm(candidate, start) for term, candidate in fewer.items()}
+        least = min(errors, key=errors.__getitem__, default=None)
+        taken = None if least is None or errors[least] >= GAIN * best_Nm else least
+        steps += [Step(f"without {term}", error, term == taken) for term, error in errors.items()]
         if taken is None:
             return model, vector, steps
-        model, best_Nm = tried[taken]
-        vector = found
+        model, best_Nm = fewer[taken], min(best_Nm, errors[taken])
+        vector = problem.fit(model, start)
 
 
 def _drives(model: Model, vector: np.ndarray) -> bool:

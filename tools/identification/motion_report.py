@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _SHOWN = 6000  # samples in a picture at most
+_WINDOW_s, _MOST_WINDOWS = 5.0, 8  # of a motion that is shown in parts; shorter ones are shown whole
 _FAMILY = 4  # curves
 _SPEEDS = 200
 
@@ -129,42 +130,98 @@ def motion_figures(found: MotionFit) -> dict[str, tuple[Any, str]]:
 
 
 def prediction_figure(found: MotionFit) -> Any:
-    """Measured and predicted torque over time, the fitted blocks shaded, and the error below."""
+    """Measured and predicted torque, the fitted blocks shaded, and the error below.
+
+    Of a motion that is too long to be read as a whole the upper pictures are three windows of held-out blocks: those
+    where the fit is best, usual and worst.
+    """
     motion = found.motion
-    every = max(1, len(motion.time_s) // _SHOWN)
-    shown = slice(None, None, every)
-    time = motion.time_s[shown] - motion.time_s[0]
-    style: dict[str, Any] = {}
-    if motion.plateaus:
-        time, style = np.arange(len(motion.time_s))[shown], {"linestyle": "", "marker": "o", "markersize": 3.0}
-    outside = ~motion.used(found.settings)[shown]
+    windows = _windows(found)
     with canvas(6.4, f"{motion.path.name}: predicted on held-out blocks") as figure:
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        upper.plot(time, motion.torque_Nm[shown], color=BLUE, label="measured", **style)
-        predicted = (motion.torque_Nm - found.errors_Nm)[shown]
-        upper.plot(
-            time,
-            predicted,
-            color=ORANGE,
-            label="predicted by the fit to the shaded blocks",
-            **{**style, "markersize": 1.5} if style else {},
-        )
-        error = np.where(outside, np.nan, found.errors_Nm[shown])
+        names = [f"window {number}" for number in range(max(1, len(windows)))]
+        axes = figure.subplot_mosaic([[*names], ["error"] * len(names)], height_ratios=(3, 2))
+        lower = axes["error"]
+        style: dict[str, Any] = {}
+        if motion.plateaus:
+            style = {"linestyle": "", "marker": "o", "markersize": 3.0}
+        whole = slice(0, len(motion.time_s))
+        for name, (words, part) in zip(names, windows or [("", whole)], strict=True):
+            _torques(axes[name], found, part, style)
+            axes[name].set_title(words, loc="left", fontsize="small")
+            axes[name].sharey(axes[names[0]])
+            axes[name].tick_params(labelleft=name == names[0])
+        shown = _decimated(whole)
+        time = _abscissa(found, shown)
+        error = np.where(motion.used(found.settings)[shown], found.errors_Nm[shown], np.nan)
         lower.plot(time, found.errors_Nm[shown], color=GREY, linewidth=0.6, label="standstill, reversal, not used")
-        lower.plot(time, error, color=BLUE, label="used", **style)
-        margin = 0.5 if motion.plateaus else 0.0
-        for number in range(0, found.blocks, 2):
-            inside = time[found.block[shown] == number]
-            for axis in (upper, lower):
-                axis.axvspan(inside[0] - margin, inside[-1] + margin, color=GREY, alpha=0.15, linewidth=0.0)
+        lower.plot(time, error, color=BLUE, label="used", **{"linewidth": 0.8, **style})
+        _shade(lower, found, shown)
+        for _, part in windows:
+            lower.axvspan(*_abscissa(found, part)[[0, -1]], color=ORANGE, alpha=0.5, linewidth=0.0)
         worst = np.nanpercentile(np.abs(error), 99.5) if np.isfinite(error).any() else 1.0
         lower.set_ylim(-2.0 * worst, 2.0 * worst)
-        upper.set_ylabel("torque at the joint [Nm]")
+        axes[names[0]].set_ylabel("torque at the joint [Nm]")
         lower.set_ylabel("measured - predicted [Nm]")
         lower.set_xlabel("plateau" if motion.plateaus else "time [s]")
-        _legend_above(upper)
+        if not windows:
+            _legend_above(axes[names[0]])
+        else:
+            axes[names[0]].legend(loc="best", fontsize="small")
         _legend_above(lower)
         return figure
+
+
+def _windows(found: MotionFit) -> list[tuple[str, slice]]:
+    """(what it is, samples) of the best, a usual and the worst window of held-out blocks; none of a short motion."""
+    motion = found.motion
+    length = round(_WINDOW_s * motion.rate_Hz)
+    count = len(motion.time_s) // length
+    if motion.plateaus or count < _MOST_WINDOWS:
+        return []
+    used = (motion.used(found.settings) & (found.block % 2 == 1))[: count * length].reshape(count, length)
+    squared = found.errors_Nm[: count * length].reshape(count, length) ** 2
+    samples = used.sum(axis=1)
+    told = np.flatnonzero(samples >= 0.3 * max(samples))
+    rmse_Nm = np.sqrt((squared * used).sum(axis=1)[told] / samples[told])
+    order = np.argsort(rmse_Nm)
+    chosen = {"best": order[0], "usual": order[len(order) // 2], "worst": order[-1]}
+    return [
+        (f"{word} window: RMSE {rmse_Nm[at]:.3g} Nm", slice(int(told[at]) * length, (int(told[at]) + 1) * length))
+        for word, at in chosen.items()
+    ]
+
+
+def _decimated(part: slice) -> slice:
+    return slice(part.start, part.stop, max(1, (part.stop - part.start) // _SHOWN))
+
+
+def _abscissa(found: MotionFit, part: slice) -> np.ndarray:
+    """Time [s], or the number of each plateau."""
+    motion = found.motion
+    return np.arange(len(motion.time_s))[part] if motion.plateaus else motion.time_s[part] - motion.time_s[0]
+
+
+def _torques(axis: Axes, found: MotionFit, part: slice, style: dict[str, Any]) -> None:
+    """Measured and predicted torque over a part of the samples."""
+    shown = _decimated(part)
+    time, measured = _abscissa(found, shown), found.motion.torque_Nm[shown]
+    axis.plot(time, measured, color=BLUE, label="measured", **style)
+    smaller = {**style, "markersize": 1.5} if style else {"linewidth": 1.0}
+    words = "predicted by the fit to the shaded blocks"
+    predicted = np.where(found.motion.used(found.settings)[shown], measured - found.errors_Nm[shown], np.nan)
+    axis.plot(time, predicted, color=ORANGE, label=words, **smaller)
+    axis.set_xmargin(0.01)
+    axis.locator_params(axis="x", nbins=6)
+    if part == slice(0, len(found.motion.time_s)):
+        _shade(axis, found, shown)
+
+
+def _shade(axis: Axes, found: MotionFit, shown: slice) -> None:
+    """The even blocks, which the prediction was fitted to."""
+    time, margin = _abscissa(found, shown), 0.5 if found.motion.plateaus else 0.0
+    for number in range(0, found.blocks, 2):
+        inside = time[found.block[shown] == number]
+        axis.axvspan(inside[0] - margin, inside[-1] + margin, color=GREY, alpha=0.15, linewidth=0.0)
 
 
 def _legend_above(axis: Axes) -> None:
@@ -202,7 +259,9 @@ def residual_figure(found: MotionFit) -> Any:
                 **{"markersize": 5.0} if motion.plateaus else {"markersize": 1.5, "alpha": 0.3},
             )
             edges = np.unique(np.percentile(x, np.linspace(0.0, 100.0, 11)))
-            place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
+            if len(edges) < 6:  # it stays at few values, such as a cold and a warm temperature
+                edges = np.linspace(x.min(), x.max(), 11)
+            place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
             means = [(x[place == k].mean(), error[place == k].mean()) for k in np.unique(place)]
             axis.plot(*np.transpose(means), "o-", color=ORANGE, markersize=4.0, linewidth=1.6)
             axis.axhline(0.0, color=GREY, linewidth=0.8)

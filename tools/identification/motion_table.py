@@ -24,6 +24,7 @@ from jointctl.tools.identification.friction_data import (
     chosen_lines,
     motor_torque_Nm,
     require_stated,
+    require_units_of_heading,
     velocity_radps,
 )
 from jointctl.tools.identification.motion_data import (
@@ -100,8 +101,9 @@ def _series(table: TableFile, given: ForeignFormat) -> RawMotion:
     torque = motor_torque_Nm(table, given, gaps=True) * ratio
     if given.time_column is not None:
         names["time"] = given.time_column
-        time_s = table.numbers(given.time_column, gaps=True)
-        time_s = (time_s - time_s[0]) * SECONDS_PER_UNIT[given.time_unit]
+        stamps_s = table.timestamps_s(given.time_column)
+        time_s = table.numbers(given.time_column, gaps=True) if stamps_s is None else stamps_s
+        time_s = (time_s - time_s[0]) * (SECONDS_PER_UNIT[given.time_unit] if stamps_s is None else 1.0)
     else:
         assert given.sample_rate_Hz is not None
         names["time"] = "--sample-rate"
@@ -124,6 +126,8 @@ def _series(table: TableFile, given: ForeignFormat) -> RawMotion:
         scale, offset = DEGC_OF_UNIT[given.temperature_unit]
         raw.temperature_degC = table.numbers(given.temperature_column, gaps=True) * scale + offset
     raw.keep_known()
+    raw.in_order()
+    raw.keep_near()
     return raw
 
 
@@ -157,3 +161,4 @@ def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
     needed += [("--position-unit", given.position_unit)] if given.position_column else []
     needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
     require_stated(table, given, needed)
+    require_units_of_heading(table, given)

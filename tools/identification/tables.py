@@ -29,6 +29,8 @@ MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"))
 _SAMPLE = 200  # lines, spread over the file, that decide on its form
 _MOST_HEAD = 40  # lines up to the first of values
 _TWO_NUMBERS = re.compile(r"[0-9]+[ \t]+[+-]?[0-9]+")  # what a comma leaves of decimal commas between spaces
+_UNIT_BEHIND = re.compile(r"\s*(?:\[([^]]*)\]|\(([^)]*)\))$")
+_TIMESTAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?\s?(Z|UTC|[+-]\d\d:?\d\d)?")
 _WITH_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
 
 
@@ -47,14 +49,19 @@ class TableFile:
     notes: tuple[str, ...] = ()
 
     def column(self, name: str) -> int:
-        """Index of a column by its name (case ignored) or number from 1."""
-        lowered = [c.lower() for c in self.columns]
-        if lowered.count(name.lower()) > 1:
-            raise DataError(
-                f"{self.path}: column {name!r} occurs {lowered.count(name.lower())} times", "give its number, from 1"
-            )
-        if name.lower() in lowered:
-            return lowered.index(name.lower())
+        """Index of a column by its name, if need be without its case or its unit in brackets, or number from 1."""
+        wanted = name.strip()
+        bare = [_UNIT_BEHIND.sub("", column) for column in self.columns]
+        for names, alike in (
+            *((list(each), wanted) for each in (self.columns, bare)),
+            *(([column.lower() for column in each], wanted.lower()) for each in (self.columns, bare)),
+        ):
+            if names.count(alike) > 1:
+                raise DataError(
+                    f"{self.path}: column {name!r} occurs {names.count(alike)} times", "give its number, from 1"
+                )
+            if alike in names:
+                return names.index(alike)
         if name.isdigit() and 1 <= int(name) <= len(self.columns):
             return int(name) - 1
         raise DataError(f"{self.path}: no column {name!r}", f"the file has: {', '.join(self.columns)}")
@@ -68,6 +75,34 @@ class TableFile:
         """A column as it is written."""
         index = self.column(name)
         return [split(line, self.mark)[index] for line in self.lines]
+
+    def unit(self, name: str) -> str:
+        """What stands in brackets behind a column's name; empty where nothing does."""
+        found = _UNIT_BEHIND.search(self.columns[self.column(name)])
+        return (found[1] or found[2] or "").strip() if found else ""
+
+    def timestamps_s(self, name: str) -> np.ndarray | None:
+        """Seconds (N,) since the first of a column of ISO 8601 or of times of day; None where the first is no such."""
+        index = self.column(name)
+        cells = [split(line, self.mark)[index] for line in self.lines]
+        if not cells or not _TIMESTAMP.fullmatch(cells[0]):
+            return None
+        texts: list[str] = []
+        zones: dict[str | None, str] = {}
+        for line, cell in zip(self.numbered, cells, strict=True):
+            found = _TIMESTAMP.fullmatch(cell)
+            zone = found[3] if found else None
+            zones.setdefault(zone, cell)
+            if found is None or len(zones) > 1:
+                wanted = f"a time as {cells[0]}" + (", in the same zone" if found else "")
+                raise DataError(f"{self.path}: line {line}: {self.columns[index]} (={cell[:40]}) must be {wanted}")
+            clock = cell.removesuffix(zone or "").strip().replace(",", ".").replace(" ", "T")
+            texts.append(clock if found[1] else "1970-01-01T" + clock.zfill(len(clock) + (clock[1] == ":")))
+        try:
+            stamps = np.array(texts, "datetime64[ns]")
+        except ValueError as error:
+            raise DataError(f"{self.path}: {self.columns[index]}: not a time: {error}") from None
+        return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), float)
 
     def only(self, chosen: np.ndarray) -> TableFile:
         """The table with some of its lines, (N,) bool."""
@@ -146,11 +181,18 @@ def read_bytes(path: Path) -> bytes:
 
 def _text(path: Path, content: bytes) -> tuple[str, int | None]:
     """(text, first byte that is not UTF-8): such a file is read as Latin-1, which is right for all that is ASCII."""
-    if b"\0" in content[:65536] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise DataError(f"{path}: is a binary file (byte {content.index(0)} is zero), not a CSV table")
-    utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    encoding = "utf-8-sig"
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encoding = "utf-16"
+    elif b"\0" in content[:65536]:
+        head = content[:1024]
+        halves = {"utf-16-le": head[1::2], "utf-16-be": head[::2]}  # of ASCII every second byte is zero
+        found = [name for name, half in halves.items() if 10 * half.count(0) > 9 * len(half)]
+        if not found or 5 * head.count(0) > 3 * len(head):
+            raise DataError(f"{path}: is a binary file (byte {content.index(0)} is zero), not a CSV table")
+        encoding = found[0]
     try:
-        return content.decode("utf-16" if utf16 else "utf-8-sig"), None
+        return content.decode(encoding), None
     except UnicodeDecodeError as error:
         return content.decode("latin-1"), error.start
 

@@ -88,6 +88,101 @@ def test_a_column_of_words_beside_the_numbers(tmp_path, columns, ours):
     alike(read_motion(written(tmp_path / "a.csv", "\n".join(["t,q,tau,state", *body])), FORMAT, SETTINGS), ours)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_two_bytes_a_character_are_read_with_and_without_their_mark(tmp_path, columns, ours, encoding):
+    text = "\n".join(["t,q,tau", *lines({name: columns[name] for name in ("t", "q", "tau")})]) + "\n"
+    alike(read_motion(written(tmp_path / "a.csv", text, encoding=encoding), FORMAT, SETTINGS), ours)
+
+
+def test_zeros_that_are_no_text_stay_a_binary_file(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"t,q" + bytes(1000) + b"3,4\n" * 300)
+    with pytest.raises(DataError, match="binary file"):
+        read_motion(tmp_path / "a.csv", FORMAT, SETTINGS)
+
+
+def test_columns_are_found_without_their_unit_and_by_their_own_case_first(tmp_path, columns, ours):
+    theirs = {"t [s]": columns["t"], "q (rad)": columns["q"], "tau [Nm]": columns["tau"], "T": columns["warmth"]}
+    given = replace(FORMAT, temperature_column="T")
+    motion = read_motion(write_table(tmp_path / "a.csv", theirs), given, SETTINGS)
+    alike(motion, ours)
+    assert motion.temperature_degC[100] == pytest.approx(columns["warmth"][100], abs=1e-3)
+    own_case = {"t": columns["t"], "q": columns["q"], "tau": columns["tau"], "T": columns["warmth"]}
+    alike(read_motion(write_table(tmp_path / "b.csv", own_case), given, SETTINGS), ours)
+    both = {**theirs, "tau (Nm)": columns["tau"]}
+    with pytest.raises(DataError, match="column 'tau' occurs 2 times"):
+        read_motion(write_table(tmp_path / "c.csv", both), given, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("heading", "change", "message"),
+    [
+        ("q [deg]", {}, r"q: its heading has deg, but --position-unit \(=rad\)"),
+        ("q (°)", {}, r"q: its heading has °, but --position-unit \(=rad\)"),
+        ("tau [mNm]", {}, r"tau: its heading has mNm, but --torque-unit \(=Nm\)"),
+        ("t [ms]", {}, r"t: its heading has ms, but --time-unit \(=s\)"),
+        ("v (rpm)", {"velocity_column": "v", "velocity_unit": "rad/s"}, r"v: its heading has rpm, but --velocity-unit"),
+    ],
+)
+def test_a_unit_in_the_heading_that_is_not_the_one_given_is_refused(tmp_path, columns, heading, change, message):
+    theirs = {(heading if name == heading.split()[0] else name): values for name, values in columns.items()}
+    with pytest.raises(DataError, match=message):
+        read(tmp_path / "a.csv", theirs, **change)
+
+
+@pytest.mark.parametrize(
+    "heading", ["q [rad]", "q (radians)", "q [raw]", "tau [N·m]", "tau [Nm]", "t [sec]", "tau (filtered)"]
+)
+def test_a_unit_in_the_heading_that_is_the_same_or_none_is_not(tmp_path, columns, ours, heading):
+    theirs = {(heading if name == heading.split()[0] else name): values for name, values in columns.items()}
+    alike(read(tmp_path / "a.csv", theirs), ours)
+
+
+# --- times ---
+
+CLOCKS = {
+    "ISO 8601": "2024-05-01T23:59:58",
+    "a space between, hours before UTC": "2024-05-01 23:59:58",
+    "of day": "9:59:58",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("style", CLOCKS)
+def test_timestamps_are_seconds(tmp_path, columns, ours, style):
+    zone = "+02:00" if "UTC" in style else ""
+    first = np.datetime64(CLOCKS[style] if "of day" not in style else "1970-01-01T09:59:58", "us")
+    stamps = [str(first + np.timedelta64(round(1e6 * t), "us")) for t in columns["t"]]
+    if "of day" in style:
+        stamps = [stamp.split("T0")[-1].split("T")[-1] for stamp in stamps]
+    body = lines({name: columns[name] for name in ("q", "tau")})
+    rows = [
+        f"{stamp.replace('T', ' ' if zone else 'T')}{zone},{line}" for stamp, line in zip(stamps, body, strict=True)
+    ]
+    alike(read_motion(written(tmp_path / "a.csv", "\n".join(["t,q,tau", *rows])), FORMAT, SETTINGS), ours)
+    rows[300] = "yesterday," + body[300]
+    with pytest.raises(DataError, match=r"line 302: t \(=yesterday\) must be a time as"):
+        read_motion(written(tmp_path / "b.csv", "\n".join(["t,q,tau", *rows])), FORMAT, SETTINGS)
+
+
+def test_lines_out_of_order_are_sorted_where_the_clock_is_even(tmp_path, columns, ours):
+    order = np.random.default_rng(3).permutation(len(columns["t"]))
+    motion = read(tmp_path / "a.csv", {name: values[order] for name, values in columns.items()})
+    assert any(note.endswith("lines out of order: sorted") for note in motion.notes)
+    alike(motion, ours)
+
+
+@pytest.mark.parametrize("back_s", [0.0025, 1.0, 3.0])
+def test_a_clock_that_was_set_back_is_not_sorted(tmp_path, columns, back_s):
+    theirs = {**columns, "t": columns["t"] - np.where(columns["t"] > 6.0, back_s + 0.005, 0.0)}
+    with pytest.raises(DataError, match="t: does not go on"):
+        read(tmp_path / "a.csv", theirs)
+
+
+def test_lines_that_stand_twice_are_left_out(tmp_path, columns, ours):
+    motion = read(tmp_path / "a.csv", {name: np.repeat(values, 2) for name, values in columns.items()})
+    assert "t: 2400 lines that stand twice: left out" in motion.notes
+    alike(motion, ours)
+
+
 # --- units, sides and signs ---
 
 
@@ -207,6 +302,29 @@ def test_samples_without_a_value_are_left_out(tmp_path, columns, ours, empty):
     assert not motion.whole[1305:1325].any()
 
 
+@pytest.mark.parametrize("name", ["t", "q", "tau"])
+def test_a_column_without_any_value_is_named(tmp_path, columns, name):
+    with pytest.raises(DataError, match=f"{name}: has no value"):
+        read(tmp_path / "a.csv", {**columns, name: columns[name] * np.nan})
+
+
+@pytest.mark.parametrize(("name", "value"), [("q", 0.0), ("q", 1e6), ("tau", -9999.0), ("v", 1e3)])
+def test_samples_that_jump_off_and_back_are_left_out(tmp_path, columns, ours, name, value):
+    """A lost message that reads as zero, a number that stands for none."""
+    theirs = {column: values.copy() for column, values in columns.items()}
+    where = np.array([at for at in range(200, 2300, 150) if abs(columns[name][at] - value) > 0.2])
+    theirs[name][where] = value
+    motion = read(tmp_path / "a.csv", theirs, velocity_column="v", velocity_unit="rad/s")
+    assert f"{name}: {len(where)} samples far off their neighbours: left out" in motion.notes
+    alike(motion, ours, 0.03)
+
+
+def test_noise_and_coarse_readings_are_not_far_off(tmp_path, columns):
+    noise = np.random.default_rng(2).standard_normal(len(columns["t"]))
+    theirs = {**columns, "q": np.round(columns["q"], 2), "tau": columns["tau"] + 20.0 * noise}
+    assert not any("far off" in note for note in read(tmp_path / "a.csv", theirs).notes)
+
+
 def test_a_cell_that_is_no_number_is_one_line(tmp_path, columns):
     rows = lines({name: columns[name] for name in ("t", "q", "tau")})
     rows[700] = rows[700].rsplit(",", 1)[0] + ",overflow"
@@ -275,6 +393,30 @@ def test_a_clock_in_another_unit_is_named(tmp_path, columns):
     with pytest.raises(DataError, match=r"t: usual step is 5 s: must be in \[1e-05..0.1\] s") as caught:
         read(tmp_path / "a.csv", {**columns, "t": columns["t"] * 1e3})
     assert "--time-unit" in caught.value.hint
+
+
+def test_a_velocity_that_does_not_follow_the_position_is_refused(tmp_path, columns):
+    with pytest.raises(DataError, match=r"v: is 0.4 rad/s throughout, q moves otherwise"):
+        read(tmp_path / "a.csv", {**columns, "v": 0.4 + 0.0 * columns["v"]}, velocity_column="v", velocity_unit="rad/s")
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(1e3, True), (1e-3, True), (5.0, True), (1.5, False), (0.7, False)])
+def test_a_torque_many_times_its_known_load_is_refused(tmp_path, factor, refused):
+    columns = motion_columns(seconds=20.0, load_Nm=60.0)
+    theirs = {**columns, "tau": factor * columns["tau"]}
+    if not refused:
+        read(tmp_path / "a.csv", theirs, load_column="load")
+        return
+    with pytest.raises(DataError, match=r"tau: goes with .* times load: must be in") as caught:
+        read(tmp_path / "a.csv", theirs, load_column="load")
+    assert "--torque-unit" in caught.value.hint
+
+
+def test_a_load_that_is_constant_is_told(tmp_path, columns):
+    told = "load: is 0 Nm throughout: gravity is not looked for"
+    assert told in read(tmp_path / "a.csv", {**columns, "load": 0.0 * columns["t"]}, load_column="load").notes
+    varied = motion_columns(seconds=12.0, load_Nm=60.0)
+    assert not any("gravity is not" in note for note in read(tmp_path / "b.csv", varied, load_column="load").notes)
 
 
 def test_a_coarse_torque_is_no_limit_and_a_limit_is_one(tmp_path, columns):

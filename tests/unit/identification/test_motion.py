@@ -23,7 +23,12 @@ from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.models import FORMS
 from jointctl.tools.identification.motion_data import Motion, MotionSettings, joined, motion_of_plateaus
 from jointctl.tools.identification.motion_fit import MotionFit, identify_motion
-from jointctl.tools.identification.motion_report import motion_remarks, motion_section
+from jointctl.tools.identification.motion_report import (
+    motion_remarks,
+    motion_section,
+    prediction_figure,
+    residual_figure,
+)
 from jointctl.tools.identification.motion_table import read_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
 from jointctl.tools.recording.run_log import RunLogWriter
@@ -430,6 +435,29 @@ def config(tmp_path):
     return path
 
 
+def test_a_long_motion_is_shown_in_windows_of_held_out_blocks_and_a_short_one_whole(loaded, folder):
+    _, found = loaded
+    figure = prediction_figure(found)
+    titles = [axis.get_title(loc="left").split(":")[0] for axis in figure.axes]
+    assert titles == ["best window", "usual window", "worst window", ""]
+    rmse_Nm = [float(axis.get_title(loc="left").split()[-2]) for axis in figure.axes[:3]]
+    assert rmse_Nm == sorted(rmse_Nm)
+    assert rmse_Nm[0] <= found.rmse_Nm(odd=True) <= rmse_Nm[2]
+    for axis in figure.axes[:3]:
+        begin, end = axis.get_lines()[0].get_xdata()[[0, -1]]
+        assert end - begin == pytest.approx(5.0, abs=0.1)
+    short = identify_motion(read(folder / "short.csv", motion_columns(seconds=20.0)), MotionSettings())
+    assert [axis.get_title(loc="left") for axis in prediction_figure(short).axes] == ["", ""]
+
+
+def test_means_of_the_residual_at_two_temperatures_stand_at_these(loaded):
+    _, found = loaded
+    two = np.where(np.arange(len(found.motion.time_s)) % 1000 < 500, 20.0, 45.0)
+    figure = residual_figure(replace(found, motion=replace(found.motion, temperature_degC=two)))
+    axis = next(axis for axis in figure.axes if "temperature" in axis.get_xlabel())
+    assert axis.get_lines()[1].get_xdata().tolist() == [20.0, 45.0]
+
+
 def test_the_python_interface_gives_the_fit_and_writes_nothing(tmp_path):
     data = write_table(tmp_path / "move.csv", motion_columns(TrueJoint(), seconds=20.0))
     table = {name: value for name, value in vars(FORMAT).items() if value is not None}
@@ -532,6 +560,15 @@ def test_friction_that_turns_round_with_the_motion_is_told_from_ripple(tmp_path)
     assert section["angle"]["share"] == [pytest.approx(0.12, rel=0.05)]
     assert section["angle"]["per_motor_turn"] == [2.0]
     assert any(line.startswith("for [ripple]: torque_Nm = [0.") for line in motion_remarks(found))
+
+
+def test_load_friction_is_not_taken_for_friction_of_the_angle(tmp_path):
+    """Gravity goes with the angle, so that its load friction looks like friction twice a joint turn."""
+    joint = TrueJoint(load_coulomb=0.12, gravity_Nm=20.0)
+    found = identify_motion(read(tmp_path / "a.csv", motion_columns(joint, seconds=60.0)), MotionSettings())
+    assert "load-coulomb" in found.model.terms
+    assert not any(term.startswith("angle-") for term in found.model.terms)
+    assert found.parameters["load_coulomb"].value == pytest.approx(0.12, abs=0.03)
 
 
 def test_a_joint_without_them_gets_none(tmp_path):
