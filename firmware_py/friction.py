@@ -194,6 +194,28 @@ def friction_curve_Nm(constants: np.ndarray, velocity_radps: np.ndarray) -> np.n
 # stable for any stiffness and period.
 
 
+@inlined
+def sliding_torque_Nm(
+    friction: FrictionConstants, reduction_ratio: float, velocity_radps: float, condition: Condition
+) -> float:
+    """g(v) at the joint [Nm], for a speed other than 0."""
+    branch = friction.positive if velocity_radps > 0.0 else friction.negative
+    return reduction_ratio * conditioned_torque_Nm(friction, branch, abs(velocity_radps), condition)
+
+
+@inlined
+def bend_bristles(
+    stiffness_Nmprad: float, damping_Nmspr: float, deflection_rad: float, velocity_radps: float, sliding_Nm: float,
+    period_s: float,
+) -> tuple[float, float]:  # fmt: skip
+    """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at this velocity, other than 0."""
+    settled_rad = math.copysign(sliding_Nm / stiffness_Nmprad, velocity_radps)
+    decay = math.exp(-abs(velocity_radps) * period_s * stiffness_Nmprad / sliding_Nm)
+    moved_rad = settled_rad + (deflection_rad - settled_rad) * decay
+    rate_radps = (moved_rad - deflection_rad) / period_s
+    return moved_rad, stiffness_Nmprad * moved_rad + damping_Nmspr * rate_radps
+
+
 @kernel
 def step_lugre(
     lugre: LuGreConstants,
@@ -205,13 +227,9 @@ def step_lugre(
     condition: Condition = UNLOADED,
 ) -> tuple[float, float]:
     """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at `velocity_radps`."""
-    speed = abs(velocity_radps)
-    if speed == 0.0:
+    if velocity_radps == 0.0:
         return deflection_rad, lugre.stiffness_Nmprad * deflection_rad
-    branch = friction.positive if velocity_radps > 0.0 else friction.negative
-    sliding_Nm = reduction_ratio * conditioned_torque_Nm(friction, branch, speed, condition)
-    settled_rad = math.copysign(sliding_Nm / lugre.stiffness_Nmprad, velocity_radps)
-    decay = math.exp(-speed * period_s * lugre.stiffness_Nmprad / sliding_Nm)
-    moved_rad = settled_rad + (deflection_rad - settled_rad) * decay
-    rate_radps = (moved_rad - deflection_rad) / period_s
-    return moved_rad, lugre.stiffness_Nmprad * moved_rad + lugre.damping_Nmspr * rate_radps
+    sliding_Nm = sliding_torque_Nm(friction, reduction_ratio, velocity_radps, condition)
+    return bend_bristles(
+        lugre.stiffness_Nmprad, lugre.damping_Nmspr, deflection_rad, velocity_radps, sliding_Nm, period_s
+    )

@@ -24,7 +24,7 @@ depends on the position."""
 from __future__ import annotations
 
 from jointctl.firmware_py.flexible_joint import sine_of_turns
-from jointctl.firmware_py.friction import UNLOADED, Condition, step_lugre
+from jointctl.firmware_py.friction import UNLOADED, Condition, bend_bristles, sliding_torque_Nm
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState, LawConstants
 
@@ -77,14 +77,18 @@ def adapted_feed_forward_Nm(
 ) -> float:  # fmt: skip
     """Friction and ripple at the joint [Nm] of the desired motion, `position_rad` that of the motor / n."""
     constants = law.adaptation
+    sliding_Nm = 0.0
+    if velocity_radps != 0.0:
+        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
     fed = 0.0
-    for k in range(BRISTLES):
-        state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        state.bristle.damping_Nmspr = law.lugre.damping_Nmspr
-        state.desired_deflection_rad[k], torque = step_lugre(
-            state.bristle, law.friction, law.reduction_ratio, state.desired_deflection_rad[k], velocity_radps,
-            law.period_s, condition,
-        )  # fmt: skip
+    for k in range(BRISTLES):  # all slide at the same torque
+        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
+        torque = stiffness * state.desired_deflection_rad[k]
+        if velocity_radps != 0.0:
+            state.desired_deflection_rad[k], torque = bend_bristles(
+                stiffness, law.lugre.damping_Nmspr, state.desired_deflection_rad[k], velocity_radps, sliding_Nm,
+                law.period_s,
+            )  # fmt: skip
         fed += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
     for j in range(constants.ripples):
         turns = constants.ripple_turns_prad[j] * position_rad
@@ -150,13 +154,16 @@ def adapt(
     """
     constants = law.adaptation
     share = law.observer.bandwidth_radps * law.period_s
-    for k in range(BRISTLES):
-        state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        state.bristle.damping_Nmspr = 0.0  # of a measured speed: noise
-        state.deflection_rad[k], torque = step_lugre(
-            state.bristle, law.friction, law.reduction_ratio, state.deflection_rad[k], velocity_radps, law.period_s,
-            condition,
-        )  # fmt: skip
+    sliding_Nm = 0.0
+    if velocity_radps != 0.0:
+        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
+    for k in range(BRISTLES):  # without damping: of a measured speed it is noise
+        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
+        torque = stiffness * state.deflection_rad[k]
+        if velocity_radps != 0.0:
+            state.deflection_rad[k], torque = bend_bristles(
+                stiffness, 0.0, state.deflection_rad[k], velocity_radps, sliding_Nm, law.period_s
+            )
         state.filtered_Nm[2 * k] += share * (max(torque, 0.0) - state.filtered_Nm[2 * k])
         state.filtered_Nm[2 * k + 1] += share * (min(torque, 0.0) - state.filtered_Nm[2 * k + 1])
     for j in range(constants.ripples):
