@@ -187,3 +187,29 @@ def test_an_error_names_its_joint_and_one_of_the_bus_none(arm: ArmConfig, error:
     with pytest.raises(JointctlError) as raised, blamed(resolve_arm(arm).joints[1].name):
         raise error
     assert raised.value.message == message
+
+
+def test_an_exchange_keeps_what_a_cycle_reads_near_and_no_long_arrays() -> None:
+    block = SharedBlock.create(1, CanopenPort, axes=3, links=3)
+    near = block.near()
+    kept = np.zeros(len(near.words), bool)
+    for first, last in near.parts:
+        kept[first:last] = True
+
+    def is_near(values: np.ndarray) -> bool:
+        return bool(kept[(values.ctypes.data - near.words.ctypes.data) // 8])
+
+    for axis in range(3):
+        state, constants = block.state, block.constants
+        short = (
+            state["cycle"],
+            state["law"]["adaptation"]["covariance"],
+            state["swing"]["faint_error"],
+            block.port["cycle"],
+        )
+        for column in (*short, constants["law"]["kp"], constants["limits"], block.links["mass_kg"]):
+            assert is_near(column[axis : axis + 1])
+        for column in (state["law"]["learning"]["learned_Nm"], constants["stream"]["values"]):
+            assert not is_near(column[axis, 1:])
+    assert 8 * kept.sum() < 3 * 8192
+    os.close(block.fd)
