@@ -51,7 +51,8 @@ class Word(IntEnum):
 
 
 WORDS = 88
-_NO_STOP, _RAMP = int(StopRequest.NONE), int(StopRequest.RAMP)
+LINE_WORDS = 8  # int64 in a cache line
+_RAMP = int(StopRequest.RAMP)
 SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
 
 
@@ -136,6 +137,30 @@ class Exchange(NamedTuple):
     link: Any
 
 
+class Near(NamedTuple):
+    """Memory that an exchange keeps in the processor's cache while it waits, for what comes after; may be empty.
+
+    Between two frames the core is another program's, and what it displaces would be missing after the last sample.
+    """
+
+    words: np.ndarray  # int64
+    parts: np.ndarray  # int64[P, 2]: index of the first word, and the one after the last
+
+
+def nothing_near() -> Near:
+    return Near(np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
+
+
+@kernel
+def fetch(near: Near) -> int:
+    """Read a word of each cache line; the caller stores the sum, which means nothing, so that all of it is read."""
+    words, total = near.words, 0
+    for part in range(len(near.parts)):
+        for index in range(near.parts[part, 0], near.parts[part, 1], LINE_WORDS):
+            total += words[index]
+    return total
+
+
 class Clock(NamedTuple):
     """The loop's time [ns]; `timespec` is int64[2] scratch."""
 
@@ -172,13 +197,19 @@ def store_word(words: np.ndarray, index: int, value: int) -> None:
 # enabled, brake together, and release their torque together once all stand.
 
 
+@inlined
+def is_stopping(state: AxisState) -> int:
+    """1 for an axis that has tripped, or brakes."""
+    return 1 if state.fault != Fault.NONE or state.phase >= AxisPhase.RAMPING else 0
+
+
 @kernel
-def stop_of(states: np.ndarray, axis: int, stop_request: int) -> int:
-    """The StopRequest for one axis: the stop word, or RAMP at least once another axis has tripped, or brakes."""
-    for other in range(len(states)):
-        if other != axis and (states[other].fault != Fault.NONE or states[other].phase >= AxisPhase.RAMPING):
-            return max(stop_request, _RAMP)
-    return stop_request
+def count_stopping(states: np.ndarray) -> int:
+    """How many axes have tripped, or brake: where it is another one, an axis ramps down too."""
+    stopping = 0
+    for axis in range(len(states)):
+        stopping += is_stopping(states[axis])
+    return stopping
 
 
 @kernel
@@ -188,20 +219,26 @@ def hold_back(states: np.ndarray) -> None:
     An axis that has just become ready waits for the next cycle too, so that all go on in the same one.  One that is
     switched off by its fault is ahead, and holds no one back.
     """
+    last, missing = INT32_MAX, 0  # the phase of those that are behind all others, and whether one of them is not ready
     for axis in range(len(states)):
-        held, phase = 0, states[axis].phase
-        for other in range(len(states)):
-            if states[other].phase < phase or (states[other].phase == phase and states[other].ready == 0):
-                held = 1
-        states[axis].held_back = held
+        phase = states[axis].phase
+        if phase < last:
+            last, missing = phase, 0
+        if phase == last and states[axis].ready == 0:
+            missing = 1
+    for axis in range(len(states)):
+        states[axis].held_back = 1 if states[axis].phase > last else missing
 
 
 @kernel
 def stop_others(states: np.ndarray, samples: np.ndarray) -> bool:
     """Ramp every axis down once another one has tripped, or brakes; True where the drives of all axes are enabled."""
-    all_enabled = True
+    all_enabled, stopping = True, count_stopping(states)
     for axis in range(len(states)):
-        request_stop(states[axis], stop_of(states, axis, _NO_STOP))
+        own = is_stopping(states[axis])
+        if stopping > own:
+            request_stop(states[axis], _RAMP)
+            stopping += is_stopping(states[axis]) - own
         all_enabled = all_enabled and is_enabled(states[axis], samples[axis])
     return all_enabled
 
@@ -273,6 +310,7 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
     several = len(memory.state) > 1
     if several:
         hold_back(memory.state)
+    stopping = count_stopping(memory.state)
     for axis in range(len(memory.state)):
         state, sample = memory.state[axis], samples[axis]
         state.slot_ns = slot.deadline_ns
@@ -281,10 +319,10 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
         state.sample_late_s = late_ns * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
         if slept_ns > SUSPENDED_MIN_NS:
             check_suspension(state, slept_ns * 1e-9)
-        sense_axis(
-            memory.constants[axis], state, sample, slot.elapsed_cycles,
-            stop_of(memory.state, axis, stop_request), supervisor_age_cycles,
-        )  # fmt: skip
+        own = is_stopping(state)
+        request = max(stop_request, _RAMP) if stopping > own else stop_request
+        sense_axis(memory.constants[axis], state, sample, slot.elapsed_cycles, request, supervisor_age_cycles)
+        stopping += is_stopping(state) - own
     if several:
         wait_for_all(memory.state)
     together, all_enabled = all_prepared(samples), stop_others(memory.state, samples)

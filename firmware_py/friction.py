@@ -203,6 +203,28 @@ def friction_curve_Nm(constants: np.ndarray, velocity_radps: np.ndarray) -> np.n
 # stable for any stiffness and period.
 
 
+@inlined
+def sliding_torque_Nm(
+    friction: FrictionConstants, reduction_ratio: float, velocity_radps: float, condition: Condition
+) -> float:
+    """g(v) at the joint [Nm], for a speed other than 0."""
+    branch = friction.positive if velocity_radps > 0.0 else friction.negative
+    return reduction_ratio * conditioned_torque_Nm(friction, branch, abs(velocity_radps), condition)
+
+
+@inlined
+def bend_bristles(
+    stiffness_Nmprad: float, damping_Nmspr: float, deflection_rad: float, velocity_radps: float, sliding_Nm: float,
+    period_s: float,
+) -> tuple[float, float]:  # fmt: skip
+    """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at this velocity, other than 0."""
+    settled_rad = math.copysign(sliding_Nm / stiffness_Nmprad, velocity_radps)
+    decay = math.exp(-abs(velocity_radps) * period_s * stiffness_Nmprad / sliding_Nm)
+    moved_rad = settled_rad + (deflection_rad - settled_rad) * decay
+    rate_radps = (moved_rad - deflection_rad) / period_s
+    return moved_rad, stiffness_Nmprad * moved_rad + damping_Nmspr * rate_radps
+
+
 @kernel
 def step_lugre(
     lugre: LuGreConstants,
@@ -214,16 +236,12 @@ def step_lugre(
     condition: Condition = UNLOADED,
 ) -> tuple[float, float]:
     """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at `velocity_radps`."""
-    speed = abs(velocity_radps)
-    if speed == 0.0:
+    if velocity_radps == 0.0:
         return deflection_rad, lugre.stiffness_Nmprad * deflection_rad
-    branch = friction.positive if velocity_radps > 0.0 else friction.negative
-    sliding_Nm = reduction_ratio * conditioned_torque_Nm(friction, branch, speed, condition)
-    settled_rad = math.copysign(sliding_Nm / lugre.stiffness_Nmprad, velocity_radps)
-    decay = math.exp(-speed * period_s * lugre.stiffness_Nmprad / sliding_Nm)
-    moved_rad = settled_rad + (deflection_rad - settled_rad) * decay
-    rate_radps = (moved_rad - deflection_rad) / period_s
-    return moved_rad, lugre.stiffness_Nmprad * moved_rad + lugre.damping_Nmspr * rate_radps
+    sliding_Nm = sliding_torque_Nm(friction, reduction_ratio, velocity_radps, condition)
+    return bend_bristles(
+        lugre.stiffness_Nmprad, lugre.damping_Nmspr, deflection_rad, velocity_radps, sliding_Nm, period_s
+    )
 
 
 # --- Feed-forward that adapts to the joint while it moves, whatever the motion: no repetition is needed ---
@@ -300,14 +318,18 @@ def adapted_feed_forward_Nm(
 ) -> float:  # fmt: skip
     """Friction and ripple at the joint [Nm] of the desired motion, `position_rad` that of the motor / n."""
     constants = law.adaptation
+    sliding_Nm = 0.0
+    if velocity_radps != 0.0:
+        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
     fed = 0.0
-    for k in range(BRISTLES):
-        state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        state.bristle.damping_Nmspr = law.lugre.damping_Nmspr
-        state.desired_deflection_rad[k], torque = step_lugre(
-            state.bristle, law.friction, law.reduction_ratio, state.desired_deflection_rad[k], velocity_radps,
-            law.period_s, condition,
-        )  # fmt: skip
+    for k in range(BRISTLES):  # all slide at the same torque
+        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
+        torque = stiffness * state.desired_deflection_rad[k]
+        if velocity_radps != 0.0:
+            state.desired_deflection_rad[k], torque = bend_bristles(
+                stiffness, law.lugre.damping_Nmspr, state.desired_deflection_rad[k], velocity_radps, sliding_Nm,
+                law.period_s,
+            )  # fmt: skip
         fed += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
     for j in range(constants.ripples):
         turns = constants.ripple_turns_prad[j] * position_rad
@@ -373,13 +395,16 @@ def adapt(
     """
     constants = law.adaptation
     share = law.observer.bandwidth_radps * law.period_s
-    for k in range(BRISTLES):
-        state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        state.bristle.damping_Nmspr = 0.0  # of a measured speed: noise
-        state.deflection_rad[k], torque = step_lugre(
-            state.bristle, law.friction, law.reduction_ratio, state.deflection_rad[k], velocity_radps, law.period_s,
-            condition,
-        )  # fmt: skip
+    sliding_Nm = 0.0
+    if velocity_radps != 0.0:
+        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
+    for k in range(BRISTLES):  # without damping: of a measured speed it is noise
+        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
+        torque = stiffness * state.deflection_rad[k]
+        if velocity_radps != 0.0:
+            state.deflection_rad[k], torque = bend_bristles(
+                stiffness, 0.0, state.deflection_rad[k], velocity_radps, sliding_Nm, law.period_s
+            )
         state.filtered_Nm[2 * k] += share * (max(torque, 0.0) - state.filtered_Nm[2 * k])
         state.filtered_Nm[2 * k + 1] += share * (min(torque, 0.0) - state.filtered_Nm[2 * k + 1])
     for j in range(constants.ripples):

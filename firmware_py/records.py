@@ -102,7 +102,6 @@ class AdaptationState:
     filtered_Nm: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
     desired_deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]
     deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # as measured
-    bristle: LuGreConstants  # of one kind of bristles, while they are computed
     fed_filtered_Nm: f8
     fed_Nm: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
     newest: i4  # in it

@@ -1,7 +1,9 @@
-"""Random arms, for the model, for an independent library, and as a URDF."""
+"""Random arms, for the model and for an independent library; the files of an arm of seven joints."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ import pinocchio as pin
 
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmLink, ArmMotion, JointKind
 from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.arm import SHIPPED_ARM
 
 GRAVITY_mps2 = (1.5, -2.5, -9.0)
 
@@ -68,3 +71,32 @@ def pinocchio_of(links: Any) -> Any:
         model.appendBodyToJoint(joints[-1], pin.Inertia(mass, centre, about_centre), pin.SE3.Identity())
     model.armature = np.array(links.motor_inertia_kgm2, dtype=float)
     return model
+
+
+LONG_ARM, LONG_RATE_Hz = 7, 500.0  # joints: 83.3 % of a bus
+_LINK = """  <link name="link{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.4"/>
+    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial></link>
+  <joint name="joint{i}" type="revolute"><parent link="{parent}"/><child link="link{i}"/><origin xyz="0.1 0 0"/>
+    <axis xyz="{axis}"/><limit lower="-1.5" upper="1.5" velocity="3.4" effort="150"/></joint>
+"""
+
+
+def long_arm(folder: Path) -> Path:
+    """The file of an arm of seven light links, with the shipped shoulder's drives and softer gains at 500 Hz."""
+    text = (SHIPPED_ARM.parent / "shoulder.toml").read_text()
+    for key, value in (("rate_Hz", LONG_RATE_Hz), ("kp", 900.0), ("kv", 60.0), ("observer_radps", 20.0)):
+        text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+        assert count == 1, key
+    links = ""
+    for i in range(LONG_ARM):
+        (folder / f"joint{i}.toml").write_text(re.sub(r"(?m)^node = 1", f"node = {i + 1}", text))
+        axis = ("0 0 1", "0 1 0")[i % 2]
+        links += _LINK.format(i=i, parent=f"link{i - 1}" if i else "base", axis=axis)
+    (folder / "arm.urdf").write_text(f'<robot name="long">\n  <link name="base"/>\n{links}</robot>\n')
+    path = folder / "arm.toml"
+    path.write_text(
+        f"[arm]\nurdf = 'arm.urdf'\njoints = {[f'joint{i}.toml' for i in range(LONG_ARM)]}\n"
+        f"motor_inertia_kgm2 = {[2.2] * LONG_ARM}\n\n[motion]\nkind = 'sine'\nduration_s = 0.0\n"
+        f"amplitude_rad = {[0.2] * LONG_ARM}\nfrequency_Hz = {[0.2 + 0.05 * i for i in range(LONG_ARM)]}\n"
+    )
+    return path

@@ -5,6 +5,9 @@ the kernels of the compiled one, the real `stop_node`.  Only what waits is repla
 other programs go on, and an SDO answer is there or does not come.  A frame is delivered in the instant in which it is
 sent; every frame is counted, and a hook runs after it.  Nothing depends on the computer's clock.
 
+An arm may be on several buses, where the nodes of all its drives must differ: the portable loop has one, which here
+sends each RPDO to its drive's bus and all else to every bus.  A bus is named by the first joint on it.
+
 Importing this replaces the clock of the whole process: for programs of their own only.
 """
 
@@ -69,8 +72,9 @@ LOOK_s = 0.005
 SUPERVISOR, SESSION = "supervisor", "session"  # the second: a thread of the first, where that is a user's program
 SWITCHING_OFF = "switching off "  # threads of the first, one a drive of an arm
 _FRAME = struct.Struct("<IB3x8s")
-CUT_OFF = new(FaultConstants)  # nothing gets to the drive, nothing comes from it
+CUT_OFF, BUS_OFF = new(FaultConstants), new(FaultConstants)  # nothing gets to the drive, or drives, or comes from there
 CUT_OFF[0].kind, CUT_OFF[0].duration_s, CUT_OFF[0].magnitude = FaultKind.FRAMES_LOST, 1e9, 1.0
+BUS_OFF[0].kind, BUS_OFF[0].duration_s = FaultKind.BUS_OFF, 1e9
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
 
@@ -85,12 +89,15 @@ class World:
         for index, device in enumerate(self.devices):
             device.queue = self.queues[index : index + 1]
         arm = no_arm_plant() if isinstance(given, Config) else arm_plant_of(given)
-        self.joints = Joint(*row, self.queues, no_faults(), fault_memory(no_faults()), arm)
+        self.bus = first_on_bus(joints)  # of each axis
+        self.buses = sorted(set(self.bus))
+        self.joints = Joint(*row, self.queues, no_faults(), fault_memory(no_faults()), arm, bus=np.array(self.bus))
         self.now_ns = 1_000_000_000
         self.frames = 0
         self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
         self.lost_to_drive = self.lost_from_drive = False
         self.cut_off: int | None = None  # the axis whose drive is on the bus no more
+        self.off_bus: int | None = None  # of which the computer's adapter is off
         self.fast = False  # frame by frame no more: whole cycles of the loop in one compiled call
         self.long_naps = False  # once the loop runs
         self.ears: list[Any] = []
@@ -199,30 +206,34 @@ class World:
 
     # --- frames ---
 
-    def send(self, sender: Any, identifier: int, data: bytes) -> None:
-        """A frame of a program: to every other one, and to the drives, which answer at once."""
+    def send(self, sender: Any, identifier: int, data: bytes, bus: int = 0) -> None:
+        """A frame of a program: to every other one on that bus, and to its drives, which answer at once."""
         self.now_ns += FRAME_NS
         frame = _FRAME.pack(identifier, len(data), data)
         self._let_joints_move()
         answers = [
             (axis, answer)
             for axis, device in enumerate(self.devices)
-            if not self.lost_to_drive and axis != self.cut_off
+            if self.bus[axis] == bus and not self._is_cut_off(axis) and not self.lost_to_drive
             for answer in device.handle(frame, self.now_ns)
         ]
         for ear in list(self.ears):
-            if ear is not sender:
+            if ear is not sender and ear.bus in (bus, None):
                 ear.deliver(identifier, data)
         self.look()
         self._count(identifier)
         for axis, answer in answers:
             self._from_drive(axis, answer)
 
+    def _is_cut_off(self, axis: int) -> bool:
+        return axis == self.cut_off or self.bus[axis] == self.off_bus
+
     def _from_drive(self, axis: int, frame: bytes) -> None:
         identifier, size, data = _FRAME.unpack(frame)
-        if not self.lost_from_drive and axis != self.cut_off:
+        if not self.lost_from_drive and not self._is_cut_off(axis):
             for ear in list(self.ears):
-                ear.deliver(identifier, data[:size])
+                if ear.bus in (self.bus[axis], None):
+                    ear.deliver(identifier, data[:size])
         self._count(identifier)
 
     def _count(self, identifier: int) -> None:
@@ -239,11 +250,12 @@ class Program:
 
 
 class SimulatedNetwork(canopen.Network):
-    """The `canopen` library on the simulated bus."""
+    """The `canopen` library on a simulated bus."""
 
-    def __init__(self, world: World, listeners: tuple[can.Listener, ...]) -> None:
+    def __init__(self, world: World, bus: int, listeners: tuple[can.Listener, ...]) -> None:
         super().__init__()
         self._world, self._ears = world, listeners
+        self.bus: Any = bus
 
     def connect(self, *_: Any, **__: Any) -> SimulatedNetwork:
         self._world.ears.append(self)
@@ -254,7 +266,7 @@ class SimulatedNetwork(canopen.Network):
             self._world.ears.remove(self)
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        self._world.send(self, can_id, bytes(data))
+        self._world.send(self, can_id, bytes(data), self.bus)
 
     def deliver(self, identifier: int, data: bytes) -> None:
         self.notify(identifier, bytearray(data), self._world.now_ns * 1e-9)
@@ -265,10 +277,12 @@ class SimulatedNetwork(canopen.Network):
 
 
 class SimulatedBus:
-    """A python-can bus for the portable loop."""
+    """A python-can bus for the portable loop: all buses of the world, with `port` CanopenPort[axes]."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    bus = None
+
+    def __init__(self, world: World, port: Any) -> None:
+        self._world, self._port = world, port
         self._waiting: deque[can.Message] = deque()
         world.ears.append(self)
 
@@ -276,7 +290,10 @@ class SimulatedBus:
         self._waiting.append(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
-        self._world.send(self, message.arbitration_id, bytes(message.data))
+        identifier, of = message.arbitration_id, self._port
+        own = np.flatnonzero((of.rpdo_id == identifier) | (of.offset_rpdo_id == identifier))
+        for bus in {self._world.bus[axis] for axis in own} or self._world.buses:
+            self._world.send(self, identifier, bytes(message.data), bus)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         if not self._waiting and timeout:
@@ -309,13 +326,12 @@ class SimulatedLoop(LoopHandle):
         self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fds: Sequence[int] = (),
         arm: ArmModel | None = None, joints: Sequence[Config] = (),
     ) -> None:  # fmt: skip
-        assert len(set(first_on_bus(joints))) <= 1, "this world has one bus"
         self.block = loop_memory.new_block(table, port, arm)
         self._tail = self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
         self._period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         self._process: Any = SimulatedProcess()
-        self._bus = SimulatedBus(self.world)
+        self._bus = SimulatedBus(self.world, self.block.port)
         self._memory, self._codec = self.block.memory(), codec_of(self.block.port)
         self._cycles(0, 0)  # loads what is compiled, before anything is forked
         self.block.words[Word.READY] = 1
@@ -352,6 +368,8 @@ class SimulatedLoop(LoopHandle):
         truth, joints = np.zeros((cycles, TRUTHS * axes)), world.joints
         if world.cut_off is not None:
             joints = joints._replace(faults=CUT_OFF, fault_memory=fault_memory(CUT_OFF, -1), faulty=world.cut_off)
+        if world.off_bus is not None:
+            joints = joints._replace(faults=BUS_OFF, fault_memory=fault_memory(BUS_OFF, -1), faulty=world.off_bus)
         scenario = Scenario(
             first_ns, period_ns, cycles, supervisor_beats=False,
             lost_to_drive=world.lost_to_drive, lost_from_drive=world.lost_from_drive,
@@ -431,16 +449,19 @@ class SilentLog:
     def write_temperature(self, time_ns: int, degC: float | None) -> None: ...
 
 
-def stop_of_this_computer(world: World, signals: StopSignals, nodes: Sequence[int]) -> None:
+Places = Sequence[tuple[int, int]]  # bus and node of each drive
+
+
+def stop_of_this_computer(world: World, signals: StopSignals, places: Places) -> None:
     """`jointctl stop`: the request through the lock of the bus, and the frames."""
-    stop_of_another_computer(world, nodes)
+    stop_of_another_computer(world, places)
     signals.on_stop_command()
 
 
-def stop_of_another_computer(world: World, nodes: Sequence[int]) -> None:
+def stop_of_another_computer(world: World, places: Places) -> None:
     """The frames alone."""
-    for node in nodes:
-        world.start(f"stop {node}", partial(stop_node, None, node, sleep=world.sleep))  # type: ignore[arg-type]
+    for bus, node in places:
+        world.start(f"stop {node}", partial(stop_node, bus, node, sleep=world.sleep))  # type: ignore[arg-type]
 
 
 class SimulatedGroup(DriveGroup):
@@ -481,18 +502,17 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
             raise canopen.SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
         return response
 
-    def new_network(_: Any, __: Any, *listeners: can.Listener) -> SimulatedNetwork:
-        return SimulatedNetwork(world, listeners)
+    def new_network(bus: Any, _: Any, *listeners: can.Listener) -> SimulatedNetwork:
+        return SimulatedNetwork(world, bus, listeners)
 
     def open_simulated(
         _: Any, configs: Sequence[Config], gate: Callable[[], None] = lambda: None, private: bool = False
     ) -> DriveGroup:
-        bus: Any = None
         drives: list[CanopenDrive] = []
-        for config in configs:
-            settings = canopen_settings(config)
+        for axis, first in enumerate(first_on_bus(configs)):
+            bus: Any = first if first == axis else drives[first]
+            settings = canopen_settings(configs[axis])
             drives.append(CanopenDrive(bus, settings, world.sleep, gate=gate, clock=lambda: world.now_ns * 1e-9))
-            bus = drives[0]
         return SimulatedGroup(world, drives)
 
     loops: list[SimulatedLoop] = []

@@ -27,6 +27,7 @@ from jointctl.drivers.canopen.cyclic import (
     note_wake,
 )
 from jointctl.drivers.drive import LOOK_LATE_NS
+from jointctl.firmware_py.cycle import Near, fetch, nothing_near
 from jointctl.firmware_py.kernel import exported, kernel
 from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, monotonic_ns, wait_watched_ns, watch
 from jointctl.firmware_py.libc import recv as receive_bytes
@@ -99,11 +100,13 @@ class CanopenLink(NamedTuple):
     port: Any  # CanopenPort[axes]
     frames: Any  # Frame[FRAME_SLOTS]
     scratch: np.ndarray  # int64[SCRATCH_WORDS or more]
+    near: Near = nothing_near()
 
 
-def link_of(port: np.recarray) -> CanopenLink:
+def link_of(port: np.recarray, near: Near | None = None) -> CanopenLink:
     """`port` CanopenPort[axes] with the other memory of the exchange."""
-    return CanopenLink(port, new(Frame, FRAME_SLOTS), np.zeros(max(SCRATCH_WORDS, len(port) + 2), np.int64))
+    scratch = np.zeros(max(SCRATCH_WORDS, len(port) + 3), np.int64)
+    return CanopenLink(port, new(Frame, FRAME_SLOTS), scratch, near or nothing_near())
 
 
 @kernel
@@ -211,6 +214,7 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
             return monotonic_ns(link.scratch) - started_ns
         if arrived_ns >= until_ns:
             return arrived_ns - started_ns
+        link.scratch[-1] = fetch(link.near)
         _wait_for_frames(ports, until_ns - arrived_ns, link.scratch)
         arrived_ns = monotonic_ns(link.scratch)
     return arrived_ns - started_ns

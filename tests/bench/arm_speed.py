@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import JointctlError
-from jointctl.firmware_py.arm_model import Arm, newton_euler
+from jointctl.firmware_py.arm_model import Arm, ArmFeedForward, newton_euler
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, Clock, CycleMemory, Exchange, Histogram, Slot, step_cycle
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
@@ -44,6 +44,7 @@ def chain(joints: int) -> Arm:
     links = random_links(random, joints, prismatic=0.0)
     links.parent[:] = np.arange(joints) - 1
     arm = arm_of(links)
+    arm.constants[0].feed_forward = ArmFeedForward.WHOLE
     set_motion(arm, *random.normal(size=(3, joints)))
     return arm
 

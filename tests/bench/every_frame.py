@@ -1,13 +1,14 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
     python tests/bench/every_frame.py [--kind run|sweep|program|arm] [--mode cst|csp|csv] [--deadline yes|no]
-                                      [--every 1] [--offset 0] [--rest 20]
+                                      [--buses 1] [--every 1] [--offset 0] [--rest 20]
                                       [--workers 2] [--phase NAME] [--injection NAME]
                                       [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
 The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
 time, frame by frame; `program` is a user's program that sends set-points through `jointctl.Joint`, `arm` a run of the
-shipped arm, where what is done to one drive is done to that of the middle joint.  Right after frame k
+shipped arm, where what is done to one drive is done to that of the middle joint; with `--buses 2` its wrist is on a
+second bus, and either adapter goes off its bus.  Right after frame k
 the process is forked for each injection; the child carries the run on to its end and judges it, the parent goes on as
 if nothing had been.  `--rest N`: every Nth frame where nothing changes: while the loop waits with the drive off, and
 from 100 ms after enabling until the stop.  Exit code 1 on a violation.
@@ -98,17 +99,22 @@ class Scene:
         return self.joints[0]
 
     @property
-    def nodes(self) -> list[int]:
-        return [canopen_section(config).node for config in self.joints]
+    def places(self) -> list[tuple[int, int]]:
+        """Bus and node of each drive."""
+        return [(bus, canopen_section(c).node) for bus, c in zip(self.world.bus, self.joints, strict=True)]
 
     @property
     def axis(self) -> int:
         """Of the joint that an injection is for, if it is for one."""
         return len(self.joints) // 2
 
+    def send(self, identifier: int, data: bytes) -> None:
+        """A frame of another program on the bus of that joint."""
+        self.world.send(None, identifier, data, self.places[self.axis][0])
+
     @property
     def node(self) -> int:
-        return self.nodes[self.axis]
+        return self.places[self.axis][1]
 
     @property
     def loop(self) -> Any:
@@ -123,7 +129,10 @@ class Scene:
         return "switching off" if loop.block.words[Word.ENDED] else loop.phase.name.lower().replace("_", " ")
 
     def names_joint(self, injection: str) -> bool:
-        """Whether the message says whose drive it was, if it was one's."""
+        """Whether the message says whose drive it was, if it was one's, or that of one on the bus."""
+        if (off := self.world.off_bus) is not None:
+            axes = [axis for axis, bus in enumerate(self.world.bus) if bus == off]
+            return any(f"node {self.places[k][1]}" in self.text or self.joints[k].path.stem in self.text for k in axes)
         if not (INJECTIONS[injection].of_one_drive or injection.startswith(OF_ONE_DRIVE)):
             return True
         return f"node {self.node}" in self.text or self.joints[self.axis].path.stem in self.text
@@ -154,13 +163,13 @@ def write_object(index: int, sub: int, value: int, size: int) -> Callable[[Scene
 
     def inject(session: Scene) -> None:
         data = struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + value.to_bytes(4, "little")
-        session.world.send(None, 0x600 + session.node, data)
+        session.send(0x600 + session.node, data)
 
     return inject
 
 
 def nmt(command: int) -> Callable[[Scene], None]:
-    return lambda session: session.world.send(None, 0, bytes([command, session.node]))
+    return lambda session: session.send(0, bytes([command, session.node]))
 
 
 def die(*names: str) -> Callable[[Scene], None]:
@@ -175,6 +184,10 @@ def die(*names: str) -> Callable[[Scene], None]:
 
 def lose(direction: str) -> Callable[[Scene], None]:
     return lambda session: setattr(session.world, direction, True)
+
+
+def switch_bus_off(number: int) -> Callable[[Scene], None]:
+    return lambda session: setattr(session.world, "off_bus", session.world.buses[number])
 
 
 @dataclass(frozen=True)
@@ -217,10 +230,11 @@ SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSI
            "timed out")  # fmt: skip
 HANGS = "the program hangs"  # but the session's thread goes on
 CUT_OFF = "one drive is cut off"
+FIRST_OFF, LAST_OFF = "adapter off the first bus", "adapter off the last bus"
 INJECTIONS = {
-    "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.nodes), at_once, (STOP_COMMAND,)),
+    "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.places), at_once, (STOP_COMMAND,)),
     "stop of another computer": Injection(
-        lambda s: stop_of_another_computer(s.world, s.nodes), at_once, OTHERS, other_controller=True
+        lambda s: stop_of_another_computer(s.world, s.places), at_once, OTHERS, other_controller=True
     ),
     "loop dies": Injection(die("loop"), by_heartbeat, ("loop process",), may_enable=True),
     "supervisor dies": Injection(die("supervisor"), by_ramp, may_enable=True),
@@ -243,6 +257,8 @@ INJECTIONS = {
     CUT_OFF: Injection(
         lambda s: setattr(s.world, "cut_off", s.axis), by_heartbeat, SILENCE, may_enable=True, of_one_drive=True
     ),
+    FIRST_OFF: Injection(switch_bus_off(0), by_heartbeat, (*SILENCE, "BUS"), may_enable=True),
+    LAST_OFF: Injection(switch_bus_off(-1), by_heartbeat, (*SILENCE, "BUS"), may_enable=True),
 }
 OF_ONE_DRIVE = ("NMT ", "SDO ")  # begin the names of these
 
@@ -304,7 +320,7 @@ def judge(
 
 
 def prepared(
-    kind: str, deadline: bool, folder: Path, mode: str = "cst"
+    kind: str, deadline: bool, folder: Path, mode: str = "cst", buses: int = 1
 ) -> tuple[Config | ArmConfig, Config | ArmConfig]:
     """The configuration of a short run, and that of its virtual drives, which have all objects."""
     eds = (ROOT / "configs" / "virtual_joint.eds").read_text()
@@ -321,6 +337,8 @@ def prepared(
             text = path.read_text()
             for key, value in SHORT.items():
                 text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+            if buses == 2 and path.name == "wrist.toml":
+                text = text.replace('"virtual0"', '"virtual1"')
             if kind != "arm":
                 text = re.sub(r'(?m)^mode = "\w+"', f'mode = "{mode}"', text)
             (own / path.name).write_text(text.replace('"virtual_joint.eds"', f'"{its_eds}"'))
@@ -377,21 +395,25 @@ class Exhaustion:
     """Runs once and forks after its frames."""
 
     def __init__(
-        self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any, mode: str = "cst"
+        self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any, mode: str = "cst",
+        buses: int = 1,
     ) -> None:  # fmt: skip
         self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
-        self.child, self.mode = False, mode
+        self.child, self.mode, self.buses = False, mode, buses
         self.parent = os.getppid()  # ends with it: no one would read what this finds
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
         only = {HANGS: "program", CUT_OFF: "arm"}  # to a single drive that is frames lost both ways
-        self.injections = [name for name in INJECTIONS if only.get(name, kind) == kind]
+        of_two = (FIRST_OFF, LAST_OFF)
+        self.injections = [
+            name for name in INJECTIONS if only.get(name, kind) == kind and (buses > 1 or name not in of_two)
+        ]
         self.why: tuple[str, int, str, int, bool, int] | None = None
 
     def run(self) -> int:
         """The number of frames of the undisturbed run."""
         with tempfile.TemporaryDirectory() as name:
-            config, joint = prepared(self.kind, self.deadline, Path(name), self.mode)
+            config, joint = prepared(self.kind, self.deadline, Path(name), self.mode, self.buses)
             for injection in WARM_UP:
                 self._warm_up(config, joint, Path(name), injection)
             with simulated(joint) as world:
@@ -544,6 +566,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kind", choices=("run", "sweep", "program", "arm"), action="append")
     parser.add_argument("--mode", choices=("cst", "csp", "csv"), default="cst", help="drive.mode of a joint")
+    parser.add_argument("--buses", type=int, choices=(1, 2), default=1, help="2: the wrist of an arm is on another one")
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--offset", type=int, default=0, help="other ones of them: so many frames earlier")
@@ -555,11 +578,20 @@ def main() -> int:
     parser.add_argument("--injection", choices=list(INJECTIONS), action="append", help="only this one")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.buses > 1 and given.kind != ["arm"]:
+        parser.error("--buses 2 is for --kind arm")
     kinds, deadlines = given.kind or ["run", "sweep", "program", "arm"], given.deadline or ["yes", "no"]
     if given.part:
         number, count = map(int, given.part.split("/"))
         one = Exhaustion(
-            kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout, given.mode
+            kinds[0],
+            deadlines[0] == "yes",
+            given.every,
+            given.rest,
+            (number, count),
+            sys.stdout,
+            given.mode,
+            given.buses,
         )
         one.phases, one.injections = given.phase or [], given.injection or one.injections
         one.chosen = given.offset
@@ -576,6 +608,8 @@ def main() -> int:
             words += [
                 "--mode",
                 given.mode,
+                "--buses",
+                str(given.buses),
                 "--rest",
                 str(given.rest),
                 f"--offset={given.offset}",

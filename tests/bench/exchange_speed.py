@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -45,6 +44,7 @@ from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
+from tests.arms import long_arm
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, measured, separate_virtual_joint, skipped
 from tests.configurations import changed
@@ -438,35 +438,6 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
     yield from _rows(case.name, ours, python_can, "python-can loop", _AGAINST_PYTHON)
     intervals = [LoopTimes(np.abs(np.diff(times.wake_us)), times.work_us, times.work_us) for times in ours]
     yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
-
-
-LONG_ARM, LONG_RATE_Hz = 7, 500.0  # joints: 83.3 % of a bus
-_LINK = """  <link name="link{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.4"/>
-    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial></link>
-  <joint name="joint{i}" type="revolute"><parent link="{parent}"/><child link="link{i}"/><origin xyz="0.1 0 0"/>
-    <axis xyz="{axis}"/><limit lower="-1.5" upper="1.5" velocity="3.4" effort="150"/></joint>
-"""
-
-
-def long_arm(folder: Path) -> Path:
-    """The file of an arm of seven light links, with the shipped shoulder's drives and softer gains at 500 Hz."""
-    text = (SHIPPED_ARM.parent / "shoulder.toml").read_text()
-    for key, value in (("rate_Hz", LONG_RATE_Hz), ("kp", 900.0), ("kv", 60.0), ("observer_radps", 20.0)):
-        text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
-        assert count == 1, key
-    links = ""
-    for i in range(LONG_ARM):
-        (folder / f"joint{i}.toml").write_text(re.sub(r"(?m)^node = 1", f"node = {i + 1}", text))
-        axis = ("0 0 1", "0 1 0")[i % 2]
-        links += _LINK.format(i=i, parent=f"link{i - 1}" if i else "base", axis=axis)
-    (folder / "arm.urdf").write_text(f'<robot name="long">\n  <link name="base"/>\n{links}</robot>\n')
-    path = folder / "arm.toml"
-    path.write_text(
-        f"[arm]\nurdf = 'arm.urdf'\njoints = {[f'joint{i}.toml' for i in range(LONG_ARM)]}\n"
-        f"motor_inertia_kgm2 = {[2.2] * LONG_ARM}\n\n[motion]\nkind = 'sine'\nduration_s = 0.0\n"
-        f"amplitude_rad = {[0.2] * LONG_ARM}\nfrequency_Hz = {[0.2 + 0.05 * i for i in range(LONG_ARM)]}\n"
-    )
-    return path
 
 
 def arm_for_comparison(path: Path, channel: str) -> ArmConfig:

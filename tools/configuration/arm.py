@@ -20,13 +20,13 @@ from pydantic_core import PydanticCustomError
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmFeedForward, ArmLink, ArmMotion, JointKind
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED
-from jointctl.tools.configuration.canopen import TORQUE_WANTED, CanopenSection
+from jointctl.tools.configuration.canopen import TORQUE_WANTED, CanopenSection, canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_line, problem_lines, raise_if
-from jointctl.tools.configuration.load import config_of, load_config, read_document, with_units
+from jointctl.tools.configuration.load import config_of, read_document, with_units
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.configuration.sections import Duration, Rule, Section, Trajectory, between, is_number
-from jointctl.tools.configuration.urdf import Body, Urdf, bodies_of, of_body, read_urdf
+from jointctl.tools.configuration.urdf import Body, LARGEST_LENGTH_m, Urdf, bodies_of, of_body, read_urdf
 
 # --- [motion] of an arm file: one motion for all joints, turned into a [trajectory] for each of them ---
 
@@ -135,14 +135,29 @@ def trajectories(motion: ArmTrajectory, configs: tuple[Config, ...], names: tupl
 SHIPPED_ARM = SHIPPED_FOLDER / "arm" / "arm.toml"
 _SLACK_rad = 1e-6  # by which the digits of two files may differ
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1, max_length=LARGEST_ARM)]
-Vector = Annotated[list[Annotated[float, between(-1000.0, 1000.0)]], Field(min_length=3, max_length=3)]
+GRAVITY_mps2 = (1.5, 30.0)  # of any place where an arm may be; beyond that it is in another unit
+_GRAVITY_TEXT = f"3 numbers with a magnitude in [{GRAVITY_mps2[0]:g}..{GRAVITY_mps2[1]:g}] m/s2, or all 0"
+
+
+def _gravity(value: object) -> list[float]:
+    if isinstance(value, (list, tuple)) and len(value) == 3 and all(is_number(x) for x in value):
+        magnitude = math.hypot(*value)
+        if magnitude == 0.0 or GRAVITY_mps2[0] <= magnitude <= GRAVITY_mps2[1]:
+            return [float(x) for x in value]
+    raise PydanticCustomError("gravity", f"must be {_GRAVITY_TEXT}")
+
+
+Gravity = Annotated[list[float], BeforeValidator(Rule(_GRAVITY_TEXT, _gravity))]
+Vector = Annotated[
+    list[Annotated[float, between(-LARGEST_LENGTH_m, LARGEST_LENGTH_m)]], Field(min_length=3, max_length=3)
+]
 
 
 class ArmSection(Section):
     urdf: Annotated[str, Field(min_length=1)]  # beside the arm file
     joints: Names  # configuration files, beside the arm file, in the order of the chain
     joint_names: Names | None = None  # of the URDF; none = all that move, in their order
-    gravity_mps2: Vector = Field(default=[0.0, 0.0, -9.81])  # in the frame of the URDF's base
+    gravity_mps2: Gravity = Field(default=[0.0, 0.0, -9.81])  # in the frame of the URDF's base
     feed_forward: Literal["whole", "gravity", "none"] = "whole"  # how much of the arm's model the joints get
     # of motor and reducer, at the joint; none = reducer.motor_inertia_kgm2 of each joint
     motor_inertia_kgm2: PerJoint | None = None
@@ -246,7 +261,7 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
         raise_if([f"{path}: {line}" for line in problem_lines(error.errors(include_url=False), data, _ArmFile)])
         raise
     arm = file.arm
-    alone = tuple(load_config(path.parent / name) for name in arm.joints)
+    alone = tuple(_joint_alone(path, name) for name in arm.joints)
     urdf = read_urdf(path.parent / arm.urdf)
     names, remarks = _names(path, arm, urdf)
     bodies, inertias = _bodies(path, arm, urdf, names, alone)
@@ -255,6 +270,13 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     return ArmConfig(
         path, text, arm, joints, names, urdf, tuple(bodies), _model(arm, bodies, inertias), (*converted, *remarks)
     )
+
+
+def _joint_alone(path: Path, name: str) -> Config:
+    file, text, data = path.parent / name, *read_document(path.parent / name)
+    if "arm" in data:
+        raise_if([f"{path}: arm.joints: {name} must be the file of a joint, and is that of an arm"])
+    return config_of(file, text, data)
 
 
 def _names(path: Path, arm: ArmSection, urdf: Urdf) -> tuple[tuple[str, ...], list[str]]:
@@ -272,8 +294,14 @@ def _names(path: Path, arm: ArmSection, urdf: Urdf) -> tuple[tuple[str, ...], li
         key = "arm.joint_names" if arm.joint_names is not None else f"{urdf.path.name}: joints that move"
         wrong.append(f"{key} (={len(names)}: {', '.join(names)}) must be as many as arm.joints (={len(arm.joints)})")
     raise_if([f"{path}: {line}" for line in wrong])
-    return names, [f"joint {name} of {urdf.path.name} is not the arm's: it stands at 0" for name in moving
-                   if name not in names]  # fmt: skip
+    standing = [f"joint {name} of {urdf.path.name} is not the arm's: it stands at 0" for name in moving
+                if name not in names]  # fmt: skip
+    standing += [
+        f"joint {joint.name} of {urdf.path.name} mimics {joint.mimics}: for the model it stands at 0"
+        for joint in urdf.joints
+        if joint.mimics is not None
+    ]
+    return names, standing
 
 
 def _bodies(
@@ -347,6 +375,12 @@ def bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
             found.append(
                 f"{name}: loop.rate_Hz (={config.loop.rate_Hz:g}) must be that of {first} (={rate_Hz:g}): one loop"
             )
+        for key in ("heartbeat_s", "master_node"):
+            value, of_first = getattr(canopen_section(config), key), getattr(canopen_section(joints[0]), key)
+            if value != of_first:
+                found.append(
+                    f"{name}: drive.{key} (={value:g}) must be that of {first} (={of_first:g}): one heartbeat for all"
+                )
         bus = config.bus.interface, config.bus.channel
         before, bitrate = bitrates.setdefault(bus, (name, config.bus.bitrate_bitps))
         if config.bus.bitrate_bitps != bitrate:
@@ -363,15 +397,28 @@ def bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
 
 
 def _limit_problems(arm: ArmSection, joints: tuple[Config, ...], bodies: list[Body]) -> list[str]:
-    """What the URDF allows less than a joint's file."""
+    """What the URDF allows less than a joint's file, and what it must say of a joint's limits."""
     found = []
     for name, config, body in zip(arm.joints, joints, bodies, strict=True):
         limits, joint = config.limits, body.joint
+        stated = {
+            "lower": joint.lower_rad, "upper": joint.upper_rad, "velocity": joint.velocity_max_radps,
+            "effort": joint.effort_max_Nm,
+        }  # fmt: skip
+        missing = [key for key, value in stated.items() if value is None]
+        if missing and joint.kind == "revolute":
+            found.append(f"joint {joint.name} in {arm.urdf}: <limit> must have {', '.join(missing)}")
+        for key in ("velocity", "effort"):
+            value = stated[key]
+            if value is not None and not value > 0.0:
+                found.append(f"joint {joint.name} in {arm.urdf}: limit {key} (={value:g}) must be above 0; not known?")
+        if found:
+            continue
         rows: tuple[tuple[str, float, str, float | None], ...] = (
             ("position_min_rad", limits.position_min_rad, "least", joint.lower_rad),
             ("position_max_rad", limits.position_max_rad, "most", joint.upper_rad),
-            ("velocity_max_radps", limits.velocity_max_radps, "most", joint.velocity_max_radps or None),
-            ("torque_max_Nm", limits.torque_max_Nm, "most", joint.effort_max_Nm or None),
+            ("velocity_max_radps", limits.velocity_max_radps, "most", joint.velocity_max_radps),
+            ("torque_max_Nm", limits.torque_max_Nm, "most", joint.effort_max_Nm),
         )
         for key, value, word, allowed in rows:
             beyond = allowed is not None and (value < allowed if word == "least" else value > allowed)

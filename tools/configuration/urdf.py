@@ -23,6 +23,7 @@ from jointctl.tools.configuration.config import raise_if
 # beyond these a number is taken for one in another unit
 LARGEST_LENGTH_m, LARGEST_MASS_kg, LARGEST_TURN_rad, LARGEST_SPEED_radps = 10.0, 1000.0, 2.0 * math.tau, 50.0
 LARGEST_RPY_rad = math.tau + 1e-3  # of an origin: where one turn has everything
+LEAST_REACH_m = 3.0  # from its frame, within which a body of the smallest arm may have its mass
 LEAST_MASS_kg = 1e-6
 MOST_LINKS = 1000
 _NAMED = 5  # of many elements in one message
@@ -129,7 +130,8 @@ def read_urdf(path: Path) -> Urdf:
         parser.feed(content)
         robot = parser.close()
     except ElementTree.ParseError as error:
-        raise ConfigurationError(f"{path}: not valid XML: {error}") from None
+        words = "; it seems to be xacro, which must be expanded first" if b"<xacro:" in content else ""
+        raise ConfigurationError(f"{path}: not valid XML: {error}{words}") from None
     if robot.tag != "robot":
         raise ConfigurationError(f"{path}: the outermost element (={robot.tag}) must be robot; is it a URDF?")
     return _Reader(path).read(robot)
@@ -152,6 +154,8 @@ class _Reader:
         self._path, self._problems = path, list[str]()
 
     def read(self, robot: ElementTree.Element) -> Urdf:
+        if next((one for one in robot.iter() if "xacro" in one.tag), None) is not None:
+            raise ConfigurationError(f"{self._path}: has elements of xacro, which must be expanded first")
         for tag in ("link", "joint"):
             if (count := len(robot.findall(tag))) > MOST_LINKS:
                 raise ConfigurationError(f"{self._path}: {count} elements {tag}, at most {MOST_LINKS} are read")
@@ -176,6 +180,13 @@ class _Reader:
             self._problem(f"an element {tag} has no name")
         return name
 
+    def _one(self, element: ElementTree.Element, tag: str, what: str) -> ElementTree.Element | None:
+        """The child element, of which there must not be several."""
+        found = element.findall(tag)
+        if len(found) > 1:
+            self._problem(f"{what} has {len(found)} elements {tag}, at most one is allowed")
+        return found[0] if found else None
+
     def _numbers(
         self, element: ElementTree.Element | None, name: str, what: str, default: tuple[float, ...], largest: float,
         unit: str,
@@ -194,15 +205,18 @@ class _Reader:
             return np.array(default)
         if np.max(np.abs(values)) > largest:
             self._problem(f"{what} (={text!r}) must be within {largest:.4g}; {unit}?")
+            return np.array(default)
         return values
 
     def _origin(self, element: ElementTree.Element, what: str) -> Pose:
-        origin = element.find("origin")
+        origin = self._one(element, "origin", what)
         zeros = (0.0, 0.0, 0.0)
         offset = self._numbers(origin, "xyz", f"{what}: xyz", zeros, LARGEST_LENGTH_m, "millimetres instead of m")
-        roll, pitch, yaw = self._numbers(
-            origin, "rpy", f"{what}: rpy", zeros, LARGEST_RPY_rad, "degrees instead of rad"
-        )
+        degrees = "degrees instead of rad"
+        roll, pitch, yaw = angles = self._numbers(origin, "rpy", f"{what}: rpy", zeros, LARGEST_RPY_rad, degrees)
+        odd = [angle for angle in angles if abs(angle) > math.pi and angle == round(angle)]
+        if odd:  # beyond half a turn and a whole number is none of pi
+            self._problem(f"{what}: rpy has the angle {odd[0]:g}, more than half a turn; {degrees}?")
         return Pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), offset)
 
     def _joint(self, element: ElementTree.Element) -> UrdfJoint:
@@ -210,12 +224,15 @@ class _Reader:
         what = f"joint {name}"
         if kind not in (*MOVING, "fixed"):
             self._problem(f"{what}: type (={kind}) must be one of {', '.join(MOVING)}, fixed")
-        axis = self._numbers(element.find("axis"), "xyz", f"{what}: axis", (1.0, 0.0, 0.0), 1e6, "no direction")
+        axis_element = self._one(element, "axis", what)
+        if axis_element is not None and axis_element.get("xyz") is None:
+            self._problem(f"{what}: <axis> has no xyz")
+        axis = self._numbers(axis_element, "xyz", f"{what}: axis", (1.0, 0.0, 0.0), 1e6, "no direction")
         length = float(np.linalg.norm(axis))
         if not length > 1e-6:
             self._problem(f"{what}: axis must not be 0 0 0")
             axis, length = np.array([1.0, 0.0, 0.0]), 1.0
-        mimic, limit = element.find("mimic"), element.find("limit")
+        mimic, limit = self._one(element, "mimic", what), self._one(element, "limit", what)
         largest = LARGEST_LENGTH_m if kind == "prismatic" else LARGEST_TURN_rad
         unit = "millimetres instead of m" if kind == "prismatic" else "degrees instead of rad"
 
@@ -224,9 +241,9 @@ class _Reader:
                 return None
             return float(self._numbers(limit, attribute, f"{what}: limit {attribute}", (0.0,), most, why)[0])
 
-        ranged = kind == "revolute"  # a continuous joint has none
+        ranged, before = kind == "revolute", len(self._problems)  # a continuous joint has none
         low, high = (given(end, largest, unit) if ranged else None for end in ("lower", "upper"))
-        if low is not None and high is not None and not low < high:
+        if low is not None and high is not None and not low < high and len(self._problems) == before:
             self._problem(f"{what}: limit lower (={low:g}) must be below upper (={high:g})")
         return UrdfJoint(
             name=name, kind=kind, parent=self._child(element, "parent", what),
@@ -239,31 +256,32 @@ class _Reader:
         )  # fmt: skip
 
     def _child(self, element: ElementTree.Element, tag: str, what: str) -> str:
-        found = element.find(tag)
+        found = self._one(element, tag, what)
         link = "" if found is None else found.get("link", "")
         if not link:
             self._problem(f"{what}: {tag} must name a link")
         return link
 
-    def _mass(self, name: str, element: ElementTree.Element) -> Mass | None:
-        """<inertial> of a link, in the link's frame."""
-        inertial = element.find("inertial")
-        if inertial is None:
-            return None
+    def _mass(self, name: str, element: ElementTree.Element, reach_m: float) -> Mass | None:
+        """<inertial> of a link, in the link's frame; farther than `reach_m` from that no arm has its mass."""
         what = f"link {name}"
-        mass = float(
-            self._numbers(
-                inertial.find("mass"), "value", f"{what}: mass", (0.0,), LARGEST_MASS_kg, "grams instead of kg"
-            )[0]
-        )
+        before, inertial = len(self._problems), self._one(element, "inertial", what)
+        if inertial is None or len(self._problems) > before:
+            return None
+        of_mass, tensor = self._one(inertial, "mass", what), self._one(inertial, "inertia", what)
+        for tag, found, keys in (("mass", of_mass, ("value",)), ("inertia", tensor, ("ixx", "iyy", "izz"))):
+            missing = [key for key in keys if found is None or found.get(key) is None]
+            if missing:
+                self._problem(f"{what}: <inertial> has no <{tag}> with {', '.join(missing)}")
+        if len(self._problems) > before:
+            return NO_MASS
+        (mass,) = self._numbers(of_mass, "value", f"{what}: mass", (0.0,), LARGEST_MASS_kg, "grams instead of kg")
+        if len(self._problems) > before:
+            return NO_MASS
         if mass < LEAST_MASS_kg:
             self._problem(f"{what}: mass (={mass:g}) must be at least {LEAST_MASS_kg:g} kg")
             return NO_MASS
-        tensor = inertial.find("inertia")
-        if tensor is None:
-            self._problem(f"{what}: <inertial> has no <inertia>; ixx, ixy, ixz, iyy, iyz, izz are needed")
-            return NO_MASS
-        most, before = mass * LARGEST_LENGTH_m**2, len(self._problems)
+        most = mass * LARGEST_LENGTH_m**2
         xx, xy, xz, yy, yz, zz = (
             float(self._numbers(tensor, key, f"{what}: {key}", (0.0,), most, "kg mm2 instead of kg m2")[0])
             for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -280,6 +298,17 @@ class _Reader:
             )
             return NO_MASS
         pose = self._origin(inertial, f"{what}: inertial")
+        distance, radius = float(np.linalg.norm(pose.offset_m)), math.sqrt(high / mass)
+        if distance > reach_m:
+            self._problem(
+                f"{what}: the centre of its mass is {distance:.3g} m from its frame, must be within {reach_m:.3g} m; "
+                "millimetres instead of m?"
+            )
+        if radius > reach_m:
+            self._problem(
+                f"{what}: its inertia (={high:.3g} kg m2) has its mass (={mass:g} kg) {radius:.3g} m from the centre, "
+                f"must be within {reach_m:.3g} m; kg cm2 instead of kg m2, or grams?"
+            )
         return of_body(mass, pose.offset_m, pose.rotation @ inertia @ pose.rotation.T)
 
     def _tree(
@@ -313,7 +342,11 @@ class _Reader:
         for joint in joints.values():
             if joint not in order:
                 self._problem(f"joint {joint.name} is in a loop that the base {roots[0]} has no part in")
-        return roots[0], {name: self._mass(name, element) for name, element in links.items()}, tuple(order)
+            if joint.mimics is not None and joint.mimics not in joints:
+                self._problem(f"joint {joint.name}: <mimic> (={joint.mimics}) must name a joint")
+        reach_m = max(LEAST_REACH_m, sum(float(np.linalg.norm(joint.origin.offset_m)) for joint in order))
+        masses = {name: self._mass(name, element, reach_m) for name, element in links.items()}
+        return roots[0], masses, tuple(order)
 
 
 def _turn(axis: int, angle_rad: float) -> np.ndarray:

@@ -109,21 +109,12 @@ class CanopenSession(SessionDrive):
 
 def require_buses(configs: Sequence[Config]) -> None:
     """`ConfigurationError` for joints of an arm that one loop cannot command."""
-    first = configs[0]
     for config in configs:
         if config.bus.interface not in CYCLIC_INTERFACES:
             raise ConfigurationError(
                 f"{config.path}: bus.interface (={config.bus.interface}) must be one of "
                 f"{', '.join(CYCLIC_INTERFACES)} for an arm"
             )
-    for config in configs[1:]:
-        for key in ("heartbeat_s", "master_node"):
-            value, of_first = getattr(canopen_section(config), key), getattr(canopen_section(first), key)
-            if value != of_first:
-                raise ConfigurationError(
-                    f"{config.path}: drive.{key} (={value:g}) must be {of_first:g}, that of {first.path.name}: there "
-                    "is one heartbeat for all joints of an arm"
-                )
 
 
 RPDO_BYTES = 4

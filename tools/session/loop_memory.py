@@ -12,13 +12,14 @@ import math
 import mmap
 import os
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmLink, ArmMotion
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Near, Word
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 RING_RECORDS = 1 << 14  # 16 s at 1 kHz
 _LINE = 64  # bytes; nothing of one array shares a cache line with another
+_LONG = 2048  # bytes of an array of which a cycle reads little
 
 
 class SharedBlock:
@@ -96,6 +98,16 @@ class SharedBlock:
             Arm(self.arm_constants, self.links, new(ArmMotion, len(self.links) + 1)),
         )  # fmt: skip
 
+    def near(self) -> Near:
+        """What each cycle reads of every axis."""
+        words = np.frombuffer(self._memory, np.int64, len(self._memory) // 8)
+        parts = []
+        for array in (self.constants, self.state, self.sample, self.command, self.port, self.links):
+            first = array.ctypes.data - words.ctypes.data
+            for at in range(first, first + array.nbytes, array.itemsize):
+                parts += [((at + begin) // 8, (at + end) // 8) for begin, end in _small_parts(array.dtype)]
+        return Near(words, np.array(parts, np.int64))
+
     def new_records(self, tail: int, head: int) -> tuple[Any, int]:
         """(copy of this axis' log records from `tail` to `head`, how many of them had been overwritten before).
 
@@ -111,6 +123,21 @@ class SharedBlock:
         written_over = -(-max(0, now + axes - RING_RECORDS - tail - lost * axes) // axes)
         late = min(len(records), written_over) if now > head else 0
         return records[late:], lost + late
+
+
+def _small_parts(dtype: np.dtype[Any]) -> list[tuple[int, int]]:
+    """First byte and the one after the last of what lies between the long arrays of a record: histories, tables."""
+
+    def long_arrays(of: np.dtype[Any], base: int) -> Iterator[tuple[int, int]]:
+        for field, offset, *_ in (of.fields or {}).values():
+            if field.names is not None:
+                yield from long_arrays(field, base + offset)
+            elif field.itemsize >= _LONG:
+                yield base + offset, base + offset + field.itemsize
+
+    taken = sorted(long_arrays(dtype, 0))
+    begins, ends = [0, *(end for _, end in taken)], [*(begin for begin, _ in taken), dtype.itemsize]
+    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]
 
 
 def new_block(table: np.ndarray, port: type, arm: ArmModel | None) -> SharedBlock:

@@ -61,14 +61,16 @@ def loop_of(kind: str) -> tuple[type, Loop]:
     return _KINDS[kind]()
 
 
-def loop_call(driver: ModuleType, block: SharedBlock, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+def loop_call(
+    driver: ModuleType, link: object, block: SharedBlock, period_ns: int, receive_ns: int
+) -> Callable[[int], int]:
     """`run_loop` on this memory with this driver's exchange, as a function of the greatest number of cycles.
 
     0 only compiles, or loads from the cache.
     """
     from jointctl.firmware_py.cycle import run_loop
 
-    memory, exchange = block.memory(), Exchange(driver.receive, driver.send, driver.link_of(block.port))
+    memory, exchange = block.memory(), Exchange(driver.receive, driver.send, link)
     return lambda max_cycles: int(run_loop(memory, exchange, period_ns, receive_ns, max_cycles))
 
 
@@ -76,7 +78,7 @@ def compiled_call(block: SharedBlock, period_ns: int, receive_ns: int) -> Callab
     """`loop_call` on a CAN bus that is a descriptor."""
     from jointctl.drivers.canopen import exchange
 
-    return loop_call(exchange, block, period_ns, receive_ns)
+    return loop_call(exchange, exchange.link_of(block.port, block.near()), block, period_ns, receive_ns)
 
 
 @contextmanager
@@ -184,7 +186,7 @@ def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     from jointctl.drivers.elmo import exchange
     from jointctl.drivers.elmo.dialogue import SWITCH_OFF, open_descriptor
 
-    call = loop_call(exchange, block, order.period_ns, order.receive_ns)
+    call = loop_call(exchange, exchange.link_of(block.port), block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
 
     def go() -> None:

@@ -163,6 +163,59 @@ IN_URDF: list[tuple[str, str, str]] = [
     (r"<robot", "<!DOCTYPE robot><robot", "must have no DOCTYPE"),
     (r'lower="-2.1"', 'lower="2.2"', "joint elbow: limit lower (=2.2) must be below upper (=2.1)"),
     (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 10 0"', "joint wrist: rpy (='0 10 0') must be within 6.284; degrees"),
+    (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 90 0"', "joint wrist: rpy (='0 90 0') must be within 6.284; degrees"),
+    (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 0 -5"', "joint wrist: rpy has the angle -5, more than half a turn"),
+    (
+        r'<origin xyz="0.05 0 0"/>',
+        '<origin xyz="0.05 0 0" rpy="90 0 0"/>',
+        "link hand: inertial: rpy (='90 0 0') must be within 6.284; degrees",
+    ),
+    (r'<limit lower="-2.0".*?/>', "", "joint wrist in arm.urdf: <limit> must have lower, upper, velocity, effort"),
+    (r'lower="-2.0" ', "", "joint wrist in arm.urdf: <limit> must have lower"),
+    (r'velocity="4.2"', 'velocity="0"', "joint wrist in arm.urdf: limit velocity (=0) must be above 0"),
+    (r'effort="25"', 'effort="-25"', "joint wrist in arm.urdf: limit effort (=-25) must be above 0"),
+    (
+        r'revolute"(.*?)effort="150"',
+        r'continuous"\1effort="0"',
+        "joint shoulder in arm.urdf: limit effort (=0) must be above 0",
+    ),
+    (r'<mass value="0.7"/>', '<mass value="0"/>', "link hand: mass (=0) must be at least 1e-06 kg"),
+    (r'<mass value="0.7"/>', "<mass/>", "link hand: <inertial> has no <mass> with value"),
+    (r'<mass value="0.7"/>', '<mass value="1e400"/>', "link hand: mass (='1e400') must be within 1000"),
+    (r'ixx="0.0006" ', "", "link hand: <inertial> has no <inertia> with ixx"),
+    (r'ixx="0.0006"', 'ixx="0.006"', "link hand: the principal moments of its inertia"),
+    (r'ixx="0.0006"', 'ixx="-0.0006"', "link hand: the principal moments of its inertia"),
+    (
+        r'ixx="0.0006" ixy="0" ixz="0" iyy="0.0012" iyz="0" izz="0.0010"',
+        'ixx="6" ixy="0" ixz="0" iyy="12" iyz="0" izz="10"',
+        "link hand: its inertia (=12 kg m2) has its mass (=0.7 kg) 4.14 m from the centre",
+    ),
+    (r'xyz="0.05 0 0"', 'xyz="5 0 0"', "link hand: the centre of its mass is 5 m from its frame"),
+    (r"<inertial>", "<inertial/><inertial>", "link upper_arm has 2 elements inertial"),
+    (r'<axis xyz="0 1 0"/>', "<axis/>", "joint shoulder: <axis> has no xyz"),
+    (r'<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', "joint shoulder: axis (='0 1') must be 3 numbers"),
+    (r'name="wrist" type="revolute"', 'name="wrist" type="floating"', "joint wrist: type (=floating) must be one of"),
+    (r'name="wrist" type="revolute"', 'name="wrist" type="fixed"', "wrist must be a joint of arm.urdf that moves by"),
+    (
+        r'<limit lower="-2.0"',
+        '<mimic joint="elbow"/><limit lower="-2.0"',
+        "wrist must be a joint of arm.urdf that moves",
+    ),
+    (r'<limit lower="-2.0"', '<mimic joint="thumb"/><limit lower="-2.0"', "joint wrist: <mimic> (=thumb) must name a"),
+    (
+        r"</robot>",
+        '<xacro:macro name="x"/></robot>',
+        "not valid XML: unbound prefix: line 47, column 0; it seems to be xacro",
+    ),
+    (
+        r'<robot name="arm">',
+        '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="x"/>',
+        "has elements of xacro, which must be expanded first",
+    ),
+    (r"^.*$", "hello", "not valid XML: syntax error"),
+    (r"^.*$", '<sdf version="1.6"/>', "the outermost element (=sdf) must be robot"),
+    (r"</robot>", "<!--" + "x" * (17 << 20) + "--></robot>", "at most 16777216 are read"),
+    (r'name="elbow"', 'name="shoulder"', "joint shoulder is there 2 times"),
     (r'<link name="hand">', '<link name="forearm"/><link name="hand">', "link forearm is there 2 times"),
     (
         r"</robot>",
@@ -185,6 +238,33 @@ def test_a_urdf_that_cannot_be(folder: Path, pattern: str, text: str, words: str
     assert words in problem(folder)
 
 
+@pytest.mark.parametrize(
+    ("pattern", "text"),
+    [
+        (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 -4.712389 6.28319"'),
+        (r'revolute"(.*?)<limit.*?/>', r'continuous"\1'),
+        (r'xyz="0.05 0 0"', 'xyz="2.9 0 0"'),
+        (r"<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'),
+        (r' ixy="0" ixz="0"', ""),
+        (
+            r"</robot>",
+            '<joint name="thumb" type="revolute"><parent link="hand"/><child link="thumb"/></joint>'
+            '<link name="thumb"/></robot>',
+        ),
+    ],
+    ids=["three quarters of a turn", "continuous", "long", "was xacro", "no products", "no joint of the arm"],
+)
+def test_a_urdf_just_inside_what_is_allowed(folder: Path, pattern: str, text: str) -> None:
+    change(folder / "arm.urdf", pattern, text)
+    load_arm(folder / "arm.toml")
+
+
+def test_a_joint_that_mimics_another_is_named(folder: Path) -> None:
+    finger = '<joint name="f" type="revolute"><parent link="hand"/><child link="f"/><mimic joint="wrist"/></joint>'
+    change(folder / "arm.urdf", r"</robot>", f'{finger}<link name="f"/></robot>')
+    assert load_arm(folder / "arm.toml").remarks == ("joint f of arm.urdf mimics wrist: for the model it stands at 0",)
+
+
 def test_entities_are_refused_in_whatever_encoding_the_file_is(folder: Path) -> None:
     bomb = '<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>'
     for encoding in ("utf-8", "utf-16"):
@@ -196,6 +276,11 @@ IN_FILES: list[tuple[str, str, str, str]] = [
     ("elbow.toml", r"node = 2", "node = 1", "elbow.toml: drive.node (=1) must differ from drive.node of shoulder.toml"),
     ("wrist.toml", r"rate_Hz = 1000.0", "rate_Hz = 500.0", "wrist.toml: loop.rate_Hz (=500) must be that of shoulder"),
     ("wrist.toml", r"bitrate_bitps = 1_000_000", "bitrate_bitps = 500_000", "wrist.toml: bus.bitrate_bitps (=500000)"),
+    ("wrist.toml", r"heartbeat_s = 0.2", "heartbeat_s = 0.3", "wrist.toml: drive.heartbeat_s (=0.3) must be that of"),
+    ("wrist.toml", r"node = 3", "node = 3\nmaster_node = 99", "wrist.toml: drive.master_node (=99) must be that of"),
+    ("arm.toml", r'"elbow.toml"', '"arm.toml"', "arm.joints: arm.toml must be the file of a joint, and is that of an"),
+    ("arm.toml", r"-9.81", "-981", "arm.gravity_mps2 (=[0.0, 0.0, -981]) must be 3 numbers with a magnitude in"),
+    ("arm.toml", r"payload_at_m = \[0.1", "payload_at_m = [100.0", "arm.payload_at_m.0 (=100) must be in [-10..10]"),
     ("arm.toml", r'"elbow", "wrist"\]', '"elbow"]', "arm.joint_names (=2: shoulder, elbow) must be as many as"),
     ("arm.toml", r'"shoulder", "elbow", ', '"elbow", "shoulder", ', "joint shoulder is nearer to the base than elbow"),
     ("arm.toml", r"amplitude_rad = \[0.6, ", "amplitude_rad = [", "motion.amplitude_rad (=2 numbers) must have 3"),

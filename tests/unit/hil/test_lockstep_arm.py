@@ -14,9 +14,11 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.tools.analysis.arm_check import joint_loops, require_budgets
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 from jointctl.tools.virtual_joint import arm_plant_of
+from tests.arms import long_arm
 from tests.bench.arm_study import KINDS, SPEEDS, random_arm, rmse_mrad
 from tests.bench.arm_study import run as run_study
 
@@ -54,6 +56,35 @@ def test_all_joints_begin_and_end_together(whole: list[LockstepRun]) -> None:
 def test_no_joint_has_torque_before_all_may(whole: list[LockstepRun]) -> None:
     for one in whole:
         assert not one.log.command_torque_Nm[one.log.phase < AxisPhase.APPROACH].any()
+
+
+@pytest.fixture(scope="module")
+def seven(tmp_path_factory: pytest.TempPathFactory) -> LockstepArm:
+    return LockstepArm(load_arm(long_arm(tmp_path_factory.mktemp("long"))))
+
+
+def test_seven_joints_at_500_hz_fill_a_bus_and_move_together(seven: LockstepArm) -> None:
+    (budget,) = require_budgets(seven.arm)
+    assert (len(budget.joints), budget.fitting_Hz) == (7, 500.0)
+    assert budget.load == pytest.approx(0.8325)
+    assert min(joint.margins.phase_margin_deg for joint in joint_loops(seven.arm)) > 30.0
+    runs = run(seven)
+    assert [one.fault for one in runs] == [Fault.NONE] * 7
+    for phase in (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING):
+        assert len({int(one.log.cycle[np.argmax(one.log.phase == phase)]) for one in runs}) == 1, phase
+    for one in runs:
+        assert np.sqrt(np.mean(one.true_error_rad[one.tracking] ** 2)) < 1e-3
+
+
+@pytest.mark.parametrize("faulty", [0, 3, 6])
+def test_one_of_seven_joints_that_trips_stops_all_in_the_same_cycle(seven: LockstepArm, faulty: int) -> None:
+    constants = seven.constants()
+    constants.limits.following_error_max_rad[faulty] = 1e-6
+    runs = run(seven, constants=constants)
+    assert [axis for axis, one in enumerate(runs) if one.fault is not Fault.NONE] == [faulty]
+    assert runs[faulty].fault is Fault.FOLLOWING_ERROR
+    assert len({int(one.log.cycle[np.argmax(one.log.phase >= AxisPhase.RAMPING)]) for one in runs}) == 1
+    assert {int(one.state.phase) for one in runs} == {AxisPhase.FINISHED}
 
 
 def on_two_buses(arm: ArmConfig) -> ArmConfig:

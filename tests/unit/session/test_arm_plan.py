@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import blamed, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.verb_options import arm_on_bus
+from tests.configurations import changed
 
 NAMES = ["shoulder", "elbow", "wrist"]
 
@@ -58,22 +58,11 @@ def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
     assert plan.tables.shape[::2] == (3, 5)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (("bus", "interface", "slcan"), "must be one of socketcan, jointctl"),
-        (("drive", "heartbeat_s", 0.3), "must be 0.2"),
-        (("drive", "master_node", 99), "one heartbeat for all joints"),
-    ],
-)  # fmt: skip
-def test_joints_that_one_loop_cannot_command_are_refused(arm: ArmConfig, change: Any, words: str) -> None:
-    section, key, value = change
+def test_joints_that_one_loop_cannot_command_are_refused(arm: ArmConfig) -> None:
     joints = list(arm.joints)
     require_buses(joints)
-    joints[2] = joints[2].model_copy(
-        update={section: getattr(joints[2], section).model_copy(update={key: value})}
-    )  # fmt: skip
-    with pytest.raises(ConfigurationError, match=words) as caught:
+    joints[2] = changed(joints[2], bus__interface="slcan")
+    with pytest.raises(ConfigurationError, match="must be one of socketcan, jointctl") as caught:
         require_buses(joints)
     assert "wrist.toml" in str(caught.value)
 
@@ -198,3 +187,29 @@ def test_an_error_names_its_joint_and_one_of_the_bus_none(arm: ArmConfig, error:
     with pytest.raises(JointctlError) as raised, blamed(resolve_arm(arm).joints[1].name):
         raise error
     assert raised.value.message == message
+
+
+def test_an_exchange_keeps_what_a_cycle_reads_near_and_no_long_arrays() -> None:
+    block = SharedBlock.create(1, CanopenPort, axes=3, links=3)
+    near = block.near()
+    kept = np.zeros(len(near.words), bool)
+    for first, last in near.parts:
+        kept[first:last] = True
+
+    def is_near(values: np.ndarray) -> bool:
+        return bool(kept[(values.ctypes.data - near.words.ctypes.data) // 8])
+
+    for axis in range(3):
+        state, constants = block.state, block.constants
+        short = (
+            state["cycle"],
+            state["law"]["adaptation"]["covariance"],
+            state["swing"]["faint_error"],
+            block.port["cycle"],
+        )
+        for column in (*short, constants["law"]["kp"], constants["limits"], block.links["mass_kg"]):
+            assert is_near(column[axis : axis + 1])
+        for column in (state["law"]["learning"]["learned_Nm"], constants["stream"]["values"]):
+            assert not is_near(column[axis, 1:])
+    assert 8 * kept.sum() < 3 * 8192
+    os.close(block.fd)

@@ -198,7 +198,7 @@ def test_whatever_the_torque_the_object_stays_in_its_limit(torque_Nm: float, lim
 
 # --- the exported half of the lockstep simulation ---
 def test_exchange_memory_has_room_for_every_slot(wire: Wire) -> None:
-    _, frames, scratch = exchange.link_of(wire.ports)
+    _, frames, scratch, _ = exchange.link_of(wire.ports)
     assert (len(frames), frames.dtype.itemsize, len(scratch)) == (FRAME_SLOTS, 16, SCRATCH_WORDS)
     assert scratch.dtype == np.int64
 
