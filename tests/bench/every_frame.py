@@ -297,7 +297,9 @@ def judge(
     if verdict.off_after_s > allowed_s:
         problems.append(f"off after {verdict.off_after_s:.2f} s, allowed are {allowed_s:.2f} s")
     ons = [time_ns for time_ns, on in changes if on]
-    late = [time_ns for time_ns in ons if (time_ns - injected_ns) * 1e-9 > ENABLING_s]
+    # a program's silence, also that of one that hangs, is known after this time only
+    unknown_s = config.stream.client_timeout_s if name == HANGS else ENABLING_s
+    late = [time_ns for time_ns in ons if (time_ns - injected_ns) * 1e-9 > unknown_s]
     if phase == "enabling" and injection.other_controller:
         if late:
             problems.append(f"enabled {(late[-1] - injected_ns) * 1e-6:.1f} ms after it")
