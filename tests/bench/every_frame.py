@@ -300,7 +300,9 @@ def judge(
     # a program's silence, also that of one that hangs, is known after this time only
     unknown_s = config.stream.client_timeout_s if name == HANGS else ENABLING_s
     late = [time_ns for time_ns in ons if (time_ns - injected_ns) * 1e-9 > unknown_s]
-    if phase == "enabling" and injection.other_controller:
+    # of an arm the other drives are enabled until the loop knows of that one
+    of_another = len(session.joints) > 1 and name.startswith(OF_ONE_DRIVE)
+    if phase == "enabling" and (injection.other_controller or of_another):
         if late:
             problems.append(f"enabled {(late[-1] - injected_ns) * 1e-6:.1f} ms after it")
     elif ons and not injection.may_enable:
@@ -414,7 +416,7 @@ class Exhaustion:
 
     def run(self) -> int:
         """The number of frames of the undisturbed run."""
-        with tempfile.TemporaryDirectory() as name:
+        with tempfile.TemporaryDirectory() as name, contextlib.chdir(name):  # an arm's logs are for no one
             config, joint = prepared(self.kind, self.deadline, Path(name), self.mode, self.buses)
             for injection in WARM_UP:
                 self._warm_up(config, joint, Path(name), injection)
