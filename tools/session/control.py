@@ -114,6 +114,8 @@ def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
     signals = StopSignals(raising=raising)
     before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
     try:
+        if any(getattr(handler, "seen", False) for handler in before.values()):
+            raise KeyboardInterrupt  # one that Python has dropped (verbs/start.py)
         with _nothing_lost(signals):
             yield signals
     finally:

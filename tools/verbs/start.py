@@ -42,6 +42,19 @@ def _end_at_once(number: int, _: FrameType | None) -> None:
     os._exit(128 + signal.SIGINT)
 
 
+class Interruption:
+    """Raises KeyboardInterrupt, and remembers it: Python drops what a signal raises in a callback, such as that of an
+    import's lock, and goes on.  What then takes the signals over looks at `seen` of the handler before it.
+    """
+
+    def __init__(self) -> None:
+        self.seen = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.seen = True
+        raise KeyboardInterrupt
+
+
 def _stop_signals() -> list[int]:
     """Those that end this program as Ctrl-C does: of a verb that moves a joint, all that are not ignored.
 
@@ -72,8 +85,9 @@ def main() -> None:
     _require_descriptors()
     from jointctl.tools.verbs.main import main as run
 
+    interruption = Interruption()
     for number in ours:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interruption)
     run()
 
 

@@ -36,6 +36,7 @@ from jointctl.tools.session.control import (
     stop_within_s,
 )
 from jointctl.tools.session.session import NOTED_WITHIN_NS, came_before
+from jointctl.tools.verbs.start import Interruption
 
 
 # --- A program's right to a joint: what its stops ask for, and how long it may take to end ---
@@ -426,3 +427,27 @@ def test_a_fault_of_the_joint_before_the_stop_is_not_laid_to_it(early_ns: int, c
     records.time_ns = 10_000_000_000 + np.arange(3) * 1_000_000
     records.fault[1:] = Fault.POSITION_LIMIT
     assert came_before(Fault.POSITION_LIMIT, records, 10_001_000_000 + early_ns) is came_first
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_that_python_has_dropped_is_not_lost(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal that arrives in a destructor raises into nothing, and the program would go on to move the joint."""
+
+    class Dropping:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    dropped: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", dropped.append)
+    before = signal.signal(number, Interruption())
+    try:
+        with stop_signals():
+            pass  # its twin: none has come
+        Dropping()
+        assert len(dropped) == 1
+        with pytest.raises(KeyboardInterrupt), stop_signals():
+            raise AssertionError("the run began")
+    finally:
+        signal.signal(number, before)
