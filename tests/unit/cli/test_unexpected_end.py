@@ -194,9 +194,7 @@ def test_an_interruption_that_leaves_a_verb_is_one_line(
         ("", "type(signal.getsignal(signal.SIGINT)).__name__", "Interruption"),
     ],
 )
-def test_where_it_is_ignored_it_stays_so_and_else_a_verb_is_interrupted(
-    before: str, shown: str, expected: str
-) -> None:
+def test_where_it_is_ignored_it_stays_so_and_else_a_verb_is_interrupted(before: str, shown: str, expected: str) -> None:
     code = (
         f"import signal; {before} import sys; sys.argv = ['jointctl', '--version'];"
         "import jointctl.tools.verbs.start as start, atexit;"
