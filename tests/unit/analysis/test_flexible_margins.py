@@ -270,6 +270,20 @@ def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> N
     assert chosen_gains(config, loop_settings(config)[0]).met
 
 
+def test_a_light_motor_that_is_late_gets_a_filter_far_below_its_resonance() -> None:
+    """It bears several times the kv behind one."""
+    config = believed(reducer__motor_inertia_kgm2=0.15, margin__loop_delay_s=1.7e-3)
+    settings, _ = loop_settings(config)
+    gains = chosen_gains(config, settings)
+    assert gains.met
+    assert gains.kv > 10.0
+    assert gains.cutoff_Hz is not None
+    assert gains.changes()["velocity_cutoff_Hz"] == gains.cutoff_Hz < 20.0
+    chosen = replace(settings, kp=gains.kp, kv=gains.kv, observer_radps=gains.observer_radps, cutoff_Hz=gains.cutoff_Hz)
+    assert all(margins(case).stable for case in cases(chosen))
+    assert not all(margins(case).stable for case in cases(replace(chosen, cutoff_Hz=settings.cutoff_Hz)))
+
+
 def test_more_delay_leaves_smaller_gains() -> None:
     found = []
     for delay_s in (0.5e-3, 1.5e-3, 3e-3):
