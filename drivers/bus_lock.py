@@ -114,7 +114,6 @@ class BusLock:
         self._number = -1  # of the name that this lock has
         self._thread: threading.Thread | None = None
         if sys.platform != "linux" or interface == _IN_PROCESS:
-            no_longer_starting()
             return
         self._name = lock_name(interface, channel)
         try:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,6 +126,14 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
             signal.raise_signal(signal.SIGTERM)
     assert times_s == [stop_within_s(virtual_config) if configured else 3.0]
     assert "a remark" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "virtual"])  # python-can's own has no lock
+def test_with_its_lock_it_no_longer_counts_as_starting(interface: str) -> None:
+    """`jointctl stop` waits for what is starting; what has its lock is reached by it."""
+    starting_fd = os.memfd_create(bus_lock.STARTING)
+    with control_of(interface, f"starting-{os.getpid()}", Output(), 3.0), suppress(OSError):  # the number may be reused
+        assert bus_lock.STARTING not in os.readlink(f"/proc/self/fd/{starting_fd}")
 
 
 @pytest.mark.parametrize(("commanded_ns", "text"), [(1, " by jointctl stop"), (0, "")])
