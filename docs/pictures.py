@@ -87,23 +87,23 @@ def page(folder: Path) -> None:
         text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
     (folder / "joint.toml").write_text(text, encoding="utf-8")
     joint = subprocess.Popen([*JOINTCTL, "hil", "joint.toml", "-c", channel], cwd=folder)
-    told = folder / "told"
+    printed = folder / "printed"
     try:
         time.sleep(5.0)
-        with told.open("w") as stream:
+        with printed.open("w") as stream:
             words = [*JOINTCTL, "run", "joint.toml", "-c", channel, "-y", "--scope", "--scope-port", port]
             run = subprocess.Popen(words, cwd=folder, stdout=stream, stderr=stream)
         try:
-            while (found := re.search(r"scope: (http://\S+)", told.read_text())) is None:
+            while (found := re.search(r"scope: (http://\S+)", printed.read_text())) is None:
                 time.sleep(0.1)
                 if run.poll() is not None:
-                    raise SystemExit(told.read_text())
+                    raise SystemExit(printed.read_text())
             with Browser(folder, 1280, 820) as browser:
                 tab = browser.open(found[1])
                 tab.until("document.querySelector('[data-testid=\"state\"]').innerText.includes('tracking')", 60.0)
                 time.sleep(TRACKING_s)
                 if run.poll() is not None:
-                    raise SystemExit(told.read_text())
+                    raise SystemExit(printed.read_text())
                 tab.picture(DOCS / "page.png")
                 smaller(DOCS / "page.png")
         finally:

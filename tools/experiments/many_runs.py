@@ -1,6 +1,6 @@
 """Many simulated runs at once: on the processors of this computer, or on those of a cluster (dask.distributed).
 
-Either is an executor of `concurrent.futures`; what comes back belongs to its task, whoever has worked on it and how
+Either is an executor of `concurrent.futures`; what comes back belongs to its task, on which worker it ran and how
 often: a task whose worker died is done again by another one, and counts once.  A run is drawn from seed and number, so
 that a study or campaign on a cluster is the one that it is here.
 """

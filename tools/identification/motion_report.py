@@ -181,12 +181,12 @@ def _windows(found: MotionFit) -> list[tuple[str, slice]]:
     used = (motion.used(found.settings) & (found.block % 2 == 1))[: count * length].reshape(count, length)
     squared = found.errors_Nm[: count * length].reshape(count, length) ** 2
     samples = used.sum(axis=1)
-    told = np.flatnonzero(samples >= 0.3 * max(samples))
-    rmse_Nm = np.sqrt((squared * used).sum(axis=1)[told] / samples[told])
+    enough = np.flatnonzero(samples >= 0.3 * max(samples))
+    rmse_Nm = np.sqrt((squared * used).sum(axis=1)[enough] / samples[enough])
     order = np.argsort(rmse_Nm)
     chosen = {"best": order[0], "usual": order[len(order) // 2], "worst": order[-1]}
     return [
-        (f"{word} window: RMSE {rmse_Nm[at]:.3g} Nm", slice(int(told[at]) * length, (int(told[at]) + 1) * length))
+        (f"{word} window: RMSE {rmse_Nm[at]:.3g} Nm", slice(int(enough[at]) * length, (int(enough[at]) + 1) * length))
         for word, at in chosen.items()
     ]
 
