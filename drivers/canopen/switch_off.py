@@ -97,14 +97,27 @@ class SwitchOff:
         return f"unknown: {reason}; NMT stop was sent"
 
     def _brake_undisturbed(self) -> None:
-        """The quick stop, in the NMT state that the node has; not longer than it is obeyed."""
-        if state_of(self._objects) is not State.OPERATION_ENABLED:
-            return
-        self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
-        for _ in range(round(QUICK_STOP_S / POLL_S)):
-            if state_of(self._objects) is not State.QUICK_STOP_ACTIVE:
-                return
+        """The quick stop, ours or its controller's, in the NMT state that the node has; not longer than it is obeyed.
+
+        That the drive is off goes to the controller with the node's next TPDOs, of which there are none once it has
+        left operational: without them the controller's loop would wait for its time-outs.
+        """
+        state = state_of(self._objects)
+        if state is State.OPERATION_ENABLED:
+            self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
+        if state in POWERED_STATES:
+            state = self._braked()
+        if state in OFF_STATES:
             self._sleep(POLL_S)
+
+    def _braked(self) -> State:
+        """The state after the quick stop, or the one that is left when its time is over."""
+        for _ in range(round(QUICK_STOP_S / POLL_S)):
+            state = state_of(self._objects)
+            if state is not State.QUICK_STOP_ACTIVE:
+                break
+            self._sleep(POLL_S)
+        return state
 
     def _attempt(self) -> str:
         self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)

@@ -35,24 +35,50 @@ def _mark_as_starting() -> None:
 FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
 
 
+INTERRUPTED = 128 + signal.SIGINT  # as in `drivers.errors`, whose package takes its time
+AGAIN_S = 0.05
+
+
 def _end_at_once(number: int, _: FrameType | None) -> None:
     """Nothing is open yet that would have to be closed."""
+    _say(b"interrupted; nothing was begun\n")
+    os._exit(INTERRUPTED)
+
+
+def _say(line: bytes) -> None:
     with contextlib.suppress(OSError):
-        os.write(2, b"interrupted; nothing was begun\n")
-    os._exit(128 + signal.SIGINT)
+        os.write(2, line)
 
 
 class Interruption:
-    """Raises KeyboardInterrupt, and remembers it: Python drops what a signal raises in a callback, such as that of an
-    import's lock, and goes on.  What then takes the signals over looks at `seen` of the handler before it.
+    """Raises KeyboardInterrupt, and remembers it: Python drops what a signal raises in a callback or in a destructor,
+    such as that of an import's lock, and goes on.  There it is raised again, and what takes the signals over looks at
+    `seen` of the handler before it.
     """
 
     def __init__(self) -> None:
         self.seen = False
+        self.over = False  # the verb has ended, and said how: the next signal ends a program that does not come to it
+        self._number = 0
+        self._show = sys.unraisablehook
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.seen = True
+        if self.over:
+            os._exit(INTERRUPTED)
+        self.seen, self._number = True, number
         raise KeyboardInterrupt
+
+    def on_lost(self, lost: sys.UnraisableHookArgs) -> None:
+        """In the place of `sys.unraisablehook`."""
+        if lost.exc_type is not KeyboardInterrupt:
+            self._show(lost)
+            return
+        import _thread
+        import threading
+
+        again = threading.Timer(AGAIN_S, _thread.interrupt_main, [self._number])
+        again.daemon = True
+        again.start()
 
 
 def _stop_signals() -> list[int]:
@@ -86,9 +112,19 @@ def main() -> None:
     from jointctl.tools.verbs.main import main as run
 
     interruption = Interruption()
+    sys.unraisablehook = interruption.on_lost
     for number in ours:
         signal.signal(number, interruption)
-    run()
+    try:
+        run()
+    except KeyboardInterrupt:  # where a verb has not begun, or while its last words were written
+        interruption.over = True
+        _say(b"interrupted\n")
+        sys.exit(INTERRUPTED)
+    finally:
+        interruption.over = True
+        # Python would end itself by SIGINT, whatever the code, where the last `exec` of a text was interrupted
+        exec("")
 
 
 def _require_descriptors() -> None:

@@ -25,6 +25,7 @@ from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
 from tests.configurations import shipped
+from tests.places import ROOT
 from tests.sessions import Terminal, output
 
 # --- What no verb has foreseen, and a computer that has too little of something: one line and a documented code ---
@@ -221,6 +222,15 @@ def test_workers_hold_it_back_and_the_parent_gets_it() -> None:
             held = True
         assert held
         time.sleep(1.0)
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_a_stop_in_any_call_of_the_start_ends_the_verb_with_one_line(number: str) -> None:
+    """In destructors and callbacks, where Python drops what a signal raises, and while the verb says its last words."""
+    command = [sys.executable, "-m", "tests.bench.interrupted_start", "40000", number]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.stdout.endswith(" interrupted, 0 not as documented\n"), done.stdout + done.stderr
+    assert done.returncode == 0
 
 
 # --- The exit code of each error class is a promise to scripts ---

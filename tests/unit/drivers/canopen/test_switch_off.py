@@ -198,11 +198,13 @@ def test_out_of_operational_before_the_controlword_is_ours(
 @pytest.mark.parametrize(
     ("states", "log"),
     [
-        ([ON, BRAKING, BRAKING, OFF], [QUICK_STOP, POLL_S, POLL_S]),
+        ([ON, BRAKING, BRAKING, OFF], [QUICK_STOP, POLL_S, POLL_S, POLL_S]),  # once more: its controller is to see it
         ([ON, *[BRAKING] * 50, OFF], [QUICK_STOP, *[POLL_S] * 50]),
         ([ON, BRAKING, SWITCHED, OFF], [QUICK_STOP, POLL_S]),  # its controller does not leave it alone
-        ([BRAKING, OFF], []),
-        ([OFF], []),
+        ([BRAKING, BRAKING, OFF], [POLL_S, POLL_S]),  # its controller has asked for it, and sees how it ends
+        ([BRAKING, ON, OFF], []),  # enabled again: not obeyed
+        ([OFF], [POLL_S]),
+        ([SWITCHED, OFF], []),
         ([SILENCE, OFF], []),
         ([DEAD_BUS, OFF], []),
     ],
