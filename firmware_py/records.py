@@ -425,7 +425,7 @@ class SequenceConstants:  # times of the run's phases
     brake_radps2: f8  # deceleration of a controlled stop
     release_s: f8  # torque ramp to zero at standstill
     settle_cycles: i8  # consecutive good samples before enabling
-    wait_max_cycles: i8
+    wait_max_cycles: i8  # without good samples, or without a sign of life of the supervisor
     enable_max_cycles: i8
     stop_max_cycles: i8
     off_max_cycles: i8

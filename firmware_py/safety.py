@@ -192,14 +192,13 @@ def check_supervision(
     if state.phase >= AxisPhase.DISABLING:
         return
     _check_drive(state, sample)
-    limits = constants.limits
+    limits, sequence = constants.limits, constants.sequence
     if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
         if state.sample_age_cycles > limits.sample_age_max_cycles:
             trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
         if sample.bus_errors > limits.sample_age_max_cycles:
             trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
-        # not before: in WAITING the power is off, and without the supervisor's word it stays off
-        if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
+        if 0 < sequence.supervisor_max_cycles < supervisor_age_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
         client_s = client_silent_s(constants.stream, state.slot_ns)
         if state.phase <= AxisPhase.TRACKING and client_s > 0.0:  # a joint that is being stopped needs no client
@@ -207,6 +206,10 @@ def check_supervision(
         # last: samples that stay away as well tell more, and sooner
         if 0 < limits.heartbeat_age_max_cycles < sample.heartbeat_age_cycles:
             trip(state, Fault.DRIVE_SILENT, float(sample.heartbeat_age_cycles), sample.drive_error)
+    # in WAITING the power is off, and without the supervisor's word it stays off: its silence may be longer
+    if state.phase == AxisPhase.WAITING and sequence.supervisor_max_cycles > 0:
+        if supervisor_age_cycles > sequence.wait_max_cycles:
+            trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
     if powered(state.phase) and skipped_cycles > limits.skipped_max_cycles:
         trip(state, Fault.OVERRUN, float(skipped_cycles), 0)
 

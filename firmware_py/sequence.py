@@ -117,10 +117,14 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
         if moved_before_start(constants, state):
             return
         enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
-        if not moving and not enabled and constants.sequence.may_enable != 0:
-            state.ready = 1
-            if state.held_back == 0:
-                enter(state, AxisPhase.ENABLING)
+        if not moving and not enabled:
+            # good samples are waited for no longer; how long the supervisor may take is for `check_supervision`
+            state.phase_cycle = 0
+            state.held_up_cycles = 0
+            if constants.sequence.may_enable != 0:
+                state.ready = 1
+                if state.held_back == 0:
+                    enter(state, AxisPhase.ENABLING)
             return
     if waited_too_long(state, constants.sequence.wait_max_cycles) and not noise:
         if state.sample_count == 0:
@@ -129,8 +133,6 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             trip(state, Fault.DRIVE_STAYS_ENABLED, float(sample.status_word), sample.drive_error)
         elif moving:
             trip(state, Fault.NOT_AT_STANDSTILL, state.velocity.velocity_radps, 0)
-        elif state.good_samples >= constants.sequence.settle_cycles:  # all is well, but nobody allows to enable
-            trip(state, Fault.SUPERVISOR_LOST, float(state.phase_cycle), 0)
         elif state.sample_age_cycles > limits.sample_age_max_cycles:
             trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
         else:

@@ -310,5 +310,7 @@ def new(
     node: int | None = None,
     no_input: bool = False,
     arm: bool = False,
+    urdf: str | Path | None = None,
+    joints: str = "",
     quiet: bool = False,
 ) -> None: ...

@@ -26,6 +26,7 @@ from jointctl.tools.configuration.config import Config
 HIGHEST_LOAD = 0.85
 RATES_Hz = (4000, 2000, 1000, 500, 250, 200, 125, 100)  # that a clock divides well
 MOST_POSES = 3000
+FINE_GRID = 9  # points a joint
 MOTION_SAMPLES = 400  # of a motion whose torques are looked at
 
 
@@ -116,11 +117,22 @@ def require_budgets(arm: ArmConfig) -> list[BusBudget]:
 
 
 def poses(arm: ArmConfig) -> Iterator[tuple[float, ...]]:
-    """A grid within the joints' limits, their ends included; the middle is among them."""
-    count = max(3, int(MOST_POSES ** (1.0 / len(arm.joints))) // 2 * 2 + 1)
-    yield from itertools.product(
-        *(np.linspace(c.limits.position_min_rad, c.limits.position_max_rad, count) for c in arm.joints)
-    )
+    """A grid within the joints' limits, their ends included; the middle is among them.
+
+    Of more than three joints it is coarse, and ends that are turns apart are one pose: as many again fill the space.
+    """
+    axes = len(arm.joints)
+    low, high = (np.array([getattr(c.limits, f"position_{end}_rad") for c in arm.joints]) for end in ("min", "max"))
+    count = int(MOST_POSES ** (1.0 / axes)) // 2 * 2 + 1
+    if 3**axes <= MOST_POSES:
+        yield from itertools.product(*np.linspace(low, high, count).T)
+    else:
+        yield tuple(0.5 * (low + high))
+    if count < FINE_GRID:
+        golden = max(np.roots([1.0, *[0.0] * (axes - 1), -1.0, -1.0]).real)  # of that many dimensions
+        steps = golden ** -np.arange(1.0, axes + 1.0)
+        for k in range(MOST_POSES):
+            yield tuple(low + (high - low) * ((0.5 + k * steps) % 1.0))
 
 
 def pose_models(arm: ArmConfig) -> tuple[np.ndarray, np.ndarray]:

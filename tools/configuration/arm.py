@@ -226,19 +226,24 @@ class ArmConfig:
 
     def greatest_gravity_Nm(self) -> list[float]:
         """For each joint what it never has to hold more than, in whatever pose."""
-        found = []
-        for i in range(len(self.bodies)):
-            total = 0.0
-            reach = {i: 0.0}
-            for k in range(i, len(self.bodies)):
-                body = self.bodies[k]
-                if k != i:
-                    if body.parent not in reach:
-                        continue
-                    reach[k] = reach[body.parent] + float(np.linalg.norm(body.place.offset_m))
-                total += body.mass.mass_kg * reach[k] + float(np.linalg.norm(body.mass.moment_kgm))
-            found.append(total * float(np.linalg.norm(self.arm.gravity_mps2)))
-        return found
+        return [moment * float(np.linalg.norm(self.arm.gravity_mps2)) for moment in _greatest_moments_kgm(self.bodies)]
+
+
+def _greatest_moments_kgm(bodies: Sequence[Body]) -> list[float]:
+    """Of each joint: mass times centre of all that it moves is never more, in whatever pose."""
+    found = []
+    for i in range(len(bodies)):
+        total = 0.0
+        reach = {i: 0.0}
+        for k in range(i, len(bodies)):
+            body = bodies[k]
+            if k != i:
+                if body.parent not in reach:
+                    continue
+                reach[k] = reach[body.parent] + float(np.linalg.norm(body.place.offset_m))
+            total += body.mass.mass_kg * reach[k] + float(np.linalg.norm(body.mass.moment_kgm))
+        found.append(total)
+    return found
 
 
 def load_joint_or_arm(path: str | Path) -> Config | ArmConfig:
@@ -267,6 +272,9 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     bodies, inertias = _bodies(path, arm, urdf, names, alone)
     joints = _moved(path, file.motion, alone, names)
     raise_if([f"{path}: {line}" for line in (*bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
+    remarks += [f"{urdf.path.name}: {line}" for line in (*_odd_limits(bodies), *_odd_effort(bodies))]
+    for config, body in zip(joints, bodies, strict=True):
+        remarks += [f"{config.path.name}: {line}" for line in _larger(config, body)]
     return ArmConfig(
         path, text, arm, joints, names, urdf, tuple(bodies), _model(arm, bodies, inertias), (*converted, *remarks)
     )
@@ -428,6 +436,47 @@ def _limit_problems(arm: ArmSection, joints: tuple[Config, ...], bodies: list[Bo
                     "in the URDF"
                 )
     return found
+
+
+# --- Magnitudes that are allowed, but look like another unit: remarks, where no usual robot has them ---
+
+_NMM = 300.0  # times too large: 1000 from Nm to Nmm, and a torque limit may be a third of the effort
+_LEAST_EFFORT = 0.01  # of what the arm weighs when it is stretched: 0.001 from g to kg and from mm to m
+
+
+def _odd_limits(bodies: Sequence[Body]) -> Iterator[str]:
+    """More than a turn and a whole number is no number of turns."""
+    for joint in (body.joint for body in bodies):
+        for key, value in (("lower", joint.lower_rad), ("upper", joint.upper_rad)):
+            if value is not None and abs(value) > math.tau + 1e-2 and value == round(value):
+                yield f"joint {joint.name}: limit {key} (={value:g}) is more than a turn; degrees instead of rad?"
+
+
+def _odd_effort(bodies: Sequence[Body]) -> Iterator[str]:
+    """Of the joint that carries most against what it may have to carry."""
+    moments = _greatest_moments_kgm(bodies)
+    i = int(np.argmax(moments))
+    joint, load_Nm = bodies[i].joint, moments[i] * 9.81
+    if joint.effort_max_Nm is None or not load_Nm > 0.0:
+        return
+    what = f"joint {joint.name}: limit effort (={joint.effort_max_Nm:g})"
+    if joint.effort_max_Nm > _NMM * load_Nm:
+        yield f"{what} is {joint.effort_max_Nm / load_Nm:.0f} times the arm's weight, stretched; Nmm instead of Nm?"
+    elif joint.effort_max_Nm < _LEAST_EFFORT * load_Nm:
+        yield (
+            f"{what} is {joint.effort_max_Nm / load_Nm:.1%} of the arm's weight, stretched ({load_Nm:.3g} Nm); grams "
+            "instead of kg, or millimetres instead of m?"
+        )
+
+
+def _larger(config: Config, body: Body) -> Iterator[str]:
+    """An effort that the joint's own torque limit is far below."""
+    effort_Nm, limit_Nm = body.joint.effort_max_Nm, config.limits.torque_max_Nm
+    if effort_Nm is not None and effort_Nm > _NMM * limit_Nm:
+        yield (
+            f"limits.torque_max_Nm (={limit_Nm:g}) is 1/{effort_Nm / limit_Nm:.0f} of the effort of joint "
+            f"{body.joint.name} in the URDF (={effort_Nm:g}); Nmm instead of Nm?"
+        )
 
 
 def _model(arm: ArmSection, bodies: list[Body], inertias: tuple[float, ...]) -> ArmModel:

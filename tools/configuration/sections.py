@@ -193,7 +193,9 @@ class Sequence(Section):
     brake_radps2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of a controlled stop
     release_s: Annotated[float, between(0.0, 60.0)]  # torque to zero at standstill
     settle_s: Annotated[float, between(0.0, 10.0, open_low=True)]  # good samples in a row before enabling
-    wait_timeout_s: Annotated[float, between(0.0, 600.0, open_low=True)]  # for the first good samples
+    wait_timeout_s: Annotated[
+        float, between(0.0, 600.0, open_low=True)
+    ]  # for the first good samples; as long a silence of the supervisor
     # for the drive to switch on, its brake included
     enable_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]
     stop_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]  # for a stop, then the power goes

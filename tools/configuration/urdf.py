@@ -230,7 +230,8 @@ class _Reader:
         axis = self._numbers(axis_element, "xyz", f"{what}: axis", (1.0, 0.0, 0.0), 1e6, "no direction")
         length = float(np.linalg.norm(axis))
         if not length > 1e-6:
-            self._problem(f"{what}: axis must not be 0 0 0")
+            if kind != "fixed":  # some programs write one there
+                self._problem(f"{what}: axis must not be 0 0 0")
             axis, length = np.array([1.0, 0.0, 0.0]), 1.0
         mimic, limit = self._one(element, "mimic", what), self._one(element, "limit", what)
         largest = LARGEST_LENGTH_m if kind == "prismatic" else LARGEST_TURN_rad

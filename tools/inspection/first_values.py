@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
@@ -104,6 +104,7 @@ def toml_text(value: object, key: str = "") -> str:
 def _field(place: Place) -> FieldInfo:
     section, key = place
     model: Any = section_class("canopen") if section == "drive" else Config.model_fields[section].annotation
+    model = next(iter(get_args(model)), model)  # of a section that may be left out
     fields: dict[str, FieldInfo] = model.model_fields
     return fields[key]
 

@@ -12,7 +12,8 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -281,6 +282,23 @@ DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measu
 # --- The watch itself ---
 
 
+def beside(work: Callable[[], str]) -> Future[str]:
+    """What `work` gives or raises, from a thread of its own: stop and sign of life do not wait for it.
+
+    Neither does the end of this process.
+    """
+    future: Future[str] = Future()
+
+    def carry_out() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=carry_out, daemon=True).start()
+    return future
+
+
 @dataclass(frozen=True)
 class Around:
     """Who else has a part in the run, opened before the loop and closed after it."""
@@ -320,6 +338,7 @@ class RunWatch:
         self.settings_guard: SettingsGuard | None = None
         self._allowed = False  # whether the loop may enable
         self.delay_s: float | None = None  # of the loop, once it is measured
+        self._margins: Future[str] | None = None  # with that delay, in words; None before it, and once they are there
         self._drive = session_drive(config.drive.kind)
         self._stopped_by_viewer = ""
         self._allow_low_margin = plan.allow_low_margin
@@ -434,22 +453,26 @@ class RunWatch:
                 self._arm_log.take_states(records, self.loop.block.axis)
 
     def check_delay(self) -> None:
-        """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
-        if self.delay_s is not None or self.loop.cycles < min(DELAY_CYCLES, self.config.loop.rate_Hz):
+        """Once enough cycles have run with the drive off, its margins are computed; they refuse the gains or not."""
+        if self.delay_s is None:
+            histograms = self.loop.block.histograms
+            if self.loop.cycles < min(DELAY_CYCLES, self.config.loop.rate_Hz):
+                return
+            if not histograms[Histogram.ROUND_TRIP].any():
+                return  # nothing has been heard: the loop ends that itself, and tells it
+            self.delay_s = delay_s = self._drive.loop_delay_s(self.config, histograms)
+            self._margins = beside(lambda: self.margin_text(delay_s))
+        if self._margins is None or not self._margins.done():
             return
-        histograms = self.loop.block.histograms
-        if not histograms[Histogram.ROUND_TRIP].any():
-            return  # nothing has been heard: the loop ends that itself, and tells it
-        self.delay_s = self._drive.loop_delay_s(self.config, histograms)
-        text = f"loop delay {self.delay_s * 1e3:.2f} ms measured, {self.margin_text(self.delay_s)}"
+        text = f"loop delay {self.delay_s * 1e3:.2f} ms measured, {self._margins.result()}"
+        self._margins = None
         self.log.write_event(INFO, "supervisor", text)
         self.display.note(text)
-        self._may_enable()
 
     def _may_enable(self) -> None:
         """Once the delay allows the gains, and what stops the drive without us was read back."""
-        guard = self.settings_guard
-        if not self._allowed and self.delay_s is not None and (guard is None or guard.confirmed):
+        guard, judged = self.settings_guard, self.delay_s is not None and self._margins is None
+        if not self._allowed and judged and (guard is None or guard.confirmed):
             self._allowed = True
             self.loop.allow_enable()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +15,8 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput, shipped_configurations
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.urdf import UrdfJoint
+    from jointctl.tools.inspection.first_arm import JointAnswers
     from jointctl.tools.inspection.first_values import Mark, Place
     from jointctl.tools.inspection.subject import Subject
 
@@ -45,7 +47,11 @@ def new(
     ] = "elmo_gold_can",
     drive: DriveOptions = NOBODY,
     no_input: Annotated[bool, typer.Option("--no-input", help="ask nothing; what is open stays marked")] = False,
-    arm: Annotated[bool, typer.Option("--arm", help="a folder with the shipped arm: URDF, arm file, joints")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="a folder with an arm file, its URDF, its joints' files")] = False,
+    urdf: Annotated[
+        Path | None, typer.Option("--urdf", help="of the arm, with --arm; left out: the shipped arm", dir_okay=False)
+    ] = None,
+    joints: Annotated[str, typer.Option("--joints", help="of the URDF: A,B,C; left out: all that turn")] = "",
 ) -> int:
     """Write a configuration of your own, a copy of a shipped one to fill in; with -i, -c and --node from the drive.
 
@@ -54,7 +60,11 @@ def new(
     if arm:
         if drive != NOBODY:
             raise UsageError("--arm asks no drive: -i, -c, -b and --node are for a joint's file")
-        return _new_arm(path, output)
+        if urdf is None and joints:
+            raise UsageError("--joints names joints of a URDF: give --urdf as well")
+        return _new_arm(path, output) if urdf is None else _arm_of_urdf(path, urdf, joints, output, ask=not no_input)
+    if urdf is not None or joints:
+        raise UsageError("--urdf and --joints are for an arm: give --arm as well")
     from jointctl.tools.configuration.load import read_text, shipped_config
     from jointctl.tools.inspection.first_values import filled
 
@@ -86,19 +96,69 @@ def _new_arm(folder: Path, output: Output) -> int:
     """The files of the shipped arm in a folder of their own."""
     from jointctl.tools.configuration.arm import SHIPPED_ARM
 
+    sources = [one for one in sorted(SHIPPED_ARM.parent.iterdir()) if one.suffix in (".toml", ".urdf")]
+    _write_folder(folder, {source.name: source.read_bytes() for source in sources}, output)
+    output.note(f"next: jointctl check {folder / SHIPPED_ARM.name}; for an arm of your own give --urdf FILE")
+    return 0
+
+
+def _write_folder(folder: Path, files: Mapping[str, bytes], output: Output) -> None:
     try:
         folder.mkdir(parents=True)
-        for source in sorted(SHIPPED_ARM.parent.iterdir()):
-            if source.suffix in (".toml", ".urdf"):
-                (folder / source.name).write_bytes(source.read_bytes())
-                output.note(f"written: {folder / source.name}")
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+            output.note(f"written: {folder / name}")
     except FileExistsError:
         raise DataError(f"{folder}: exists already, a configuration is never overwritten") from None
     except OSError as error:
         raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    arm_file = folder / SHIPPED_ARM.name
-    output.note(f"next: put your URDF in, name its joints in {arm_file}, then jointctl check {arm_file}")
+
+
+def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, ask: bool) -> int:
+    """The files of an arm of one's own; what its URDF does not say is asked for, or has a default."""
+    from jointctl.tools.inspection.first_arm import ARM_FILE, first_arm, moving_joints, read_own_urdf
+
+    if folder.exists():
+        raise DataError(f"{folder}: exists already, a configuration is never overwritten")
+    urdf = read_own_urdf(urdf_file)
+    joints = moving_joints(urdf, [name.strip() for name in names.split(",")] if names else ())
+    output.note(f"joints of {urdf_file.name}, in their order: {', '.join(joint.name for joint in joints)}")
+    if ask:
+        _require_terminal("what is open has a default")
+        output.note("Enter takes the value in brackets")
+    answers = tuple(_answers(joint, i + 1, output, ask=ask) for i, joint in enumerate(joints))
+    files, remarks = first_arm(urdf, joints, answers, folder)
+    _write_folder(folder, files, output)
+    for remark in remarks:
+        output.warning(remark)
+    arm_file = folder / ARM_FILE
+    output.note("drives, encoders and friction are the shipped shoulder's, scaled to each effort, on a virtual bus")
+    output.note(
+        f"next: jointctl check {arm_file}, hil and run; then put the values of your drives in its joints' files"
+    )
     return 0
+
+
+def _require_terminal(otherwise: str) -> None:
+    if not sys.stdin.isatty():
+        raise UsageError("there are questions and no terminal to ask on", f"give --no-input: {otherwise}")
+
+
+def _answers(joint: UrdfJoint, node: int, output: Output, *, ask: bool) -> JointAnswers:
+    """Of one joint."""
+    from jointctl.tools.inspection.first_arm import JointAnswers, default_motor_inertia_kgm2
+    from jointctl.tools.inspection.first_values import Mark
+
+    inertia_kgm2 = default_motor_inertia_kgm2(joint)
+    values: dict[Place, object] = {}
+    if ask:
+        output.note(f"--- {joint.name}")
+        node_mark = Mark("drive", "node", "CANopen node of its drive", optional=False)
+        values |= dict(_asked(node_mark, (node, "in their order"), output))
+        what = Mark("reducer", "motor_inertia_kgm2", "motor and reducer, seen at the joint", optional=False)
+        for _, value in _asked(what, (inertia_kgm2, "a guess"), output):
+            inertia_kgm2 = float(str(value))
+    return JointAnswers(inertia_kgm2, values)
 
 
 def _from_drive(drive: DriveOptions, text: str, folder: Path, output: Output, *, ask: bool) -> dict[Place, object]:
@@ -111,8 +171,8 @@ def _from_drive(drive: DriveOptions, text: str, folder: Path, output: Output, *,
     subject = subject_of_flags(given, None)
     if subject.node is None:
         raise ConfigurationError("which node?", "give it: --node 1; `jointctl scan` finds nodes")
-    if ask and not sys.stdin.isatty():
-        raise UsageError("there are questions and no terminal to ask on", "give --no-input: what is open stays marked")
+    if ask:
+        _require_terminal("what is open stays marked")
     with canopen_network(subject) as network:
         output.note(f"reading node {subject.node} on {subject.place}")
         found = first_values(SdoReader(network, subject.node), folder)

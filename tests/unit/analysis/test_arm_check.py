@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, MarginError, UsageError
 from jointctl.tools.analysis.arm_check import (
+    MOST_POSES,
     PoseRange,
     bus_budgets,
     joint_loop,
     joint_loops,
     pose_ranges,
+    poses,
     require_budgets,
 )
 from jointctl.tools.analysis.linear_loop import RigidJoint, loop_settings
@@ -25,6 +29,8 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import JointEncoder, Reducer
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.new import DriveOptions, new
+from tests.arms import long_arm
+from tests.configurations import changed
 from tests.sessions import output
 
 SECOND = JointEncoder(source="drive", counts_per_turn=2**19, direction=1, zero_counts=0, disagreement_max_rad=0.02)
@@ -93,6 +99,29 @@ def test_inertias_and_gravity_over_the_poses(arm: ArmConfig) -> None:
     assert ranges[0].greatest_kgm2 == pytest.approx(stretched)
     assert ranges[0].least_kgm2 < 0.65 * stretched
     assert ranges[2].gravity_Nm == pytest.approx(9.81 * (0.7 * 0.05 + 0.1), rel=0.02)
+
+
+def test_joints_that_turn_all_round_are_looked_at_between_whole_turns(tmp_path: Path) -> None:
+    """Ends that are a turn apart are one pose; seven joints leave a grid with their ends and middles alone."""
+    path = long_arm(tmp_path)
+    long = load_arm(path)
+    turning = replace(long, joints=tuple(
+        changed(c, limits__position_min_rad=-math.tau, limits__position_max_rad=math.tau) for c in long.joints
+    ))  # fmt: skip
+    within, beyond = pose_ranges(long), pose_ranges(turning)
+    for one, other in zip(within[:4], beyond[:4], strict=True):
+        assert other.greatest_kgm2 == pytest.approx(one.greatest_kgm2, rel=1e-3)  # stretched
+        assert other.least_kgm2 < 0.5 * (one.least_kgm2 + one.greatest_kgm2)
+
+
+def test_many_joints_take_no_more_poses(tmp_path: Path) -> None:
+    long = load_arm(long_arm(tmp_path))
+    many = replace(long, joints=long.joints * 2)
+    found = np.array(list(poses(many)))
+    assert MOST_POSES <= len(found) <= 2 * MOST_POSES
+    for column in found.T:
+        assert -1.4 <= column.min() < -1.39
+        assert 1.39 < column.max() <= 1.4
 
 
 def test_a_smaller_inertia_is_a_higher_gain(arm: ArmConfig) -> None:

@@ -303,3 +303,86 @@ def test_two_buses_may_have_the_same_node(folder: Path) -> None:
     change(folder / "elbow.toml", r'channel = "virtual0"', 'channel = "virtual1"')
     joints: Any = load_arm(folder / "arm.toml").joints
     assert [config.drive.node for config in joints] == [1, 1, 3]
+
+
+# --- magnitudes that are allowed and look like another unit: one remark, and none on what is usual ---
+
+
+def remarks(folder: Path) -> list[str]:
+    return list(load_arm(folder / "arm.toml").remarks)
+
+
+def scaled(folder: Path, key: str, factor: float) -> None:
+    """Every number of that attribute in the URDF."""
+
+    def times(match: re.Match[str]) -> str:
+        return f'{match[1]}"{" ".join(f"{factor * float(word):g}" for word in match[2].split())}"'
+
+    path = folder / "arm.urdf"
+    path.write_text(re.sub(rf'({key}=)"([^"]*)"', times, path.read_text()))
+
+
+def test_the_shipped_arm_has_nothing_odd(folder: Path) -> None:
+    assert remarks(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "factor", "said"),
+    [
+        ("effort", 1000.0, "Nmm instead of Nm?"),
+        ("effort", 50.0, None),  # of a user who does not know it
+    ],
+)
+def test_an_effort_in_another_unit_is_named(folder: Path, key: str, factor: float, said: str | None) -> None:
+    scaled(folder, key, factor)
+    found = remarks(folder)
+    if said is None:
+        assert found == []
+        return
+    assert len(found) == 4  # of the arm as a whole, and of each joint's own limit
+    assert all(said in line for line in found)
+    assert any("shoulder" in line and "limits.torque_max_Nm (=145)" in line for line in found)
+
+
+def small(folder: Path, mass: float, length: float, effort: float = 5.0) -> list[str]:
+    """Remarks on a desk arm of 0.3 kg and 0.2 m a link, with these units."""
+    inertia = 2e-3 * mass * length**2
+    (folder / "arm.urdf").write_text(
+        '<robot name="desk"><link name="base"/>'
+        + "".join(
+            f'<link name="l{k}"><inertial><origin xyz="{0.1 * length} 0 0"/><mass value="{0.3 * mass}"/>'
+            f'<inertia ixx="{inertia}" ixy="0" ixz="0" iyy="{inertia}" iyz="0" izz="{inertia}"/></inertial></link>'
+            f'<joint name="{name}" type="revolute"><parent link="{f"l{k - 1}" if k else "base"}"/><child link="l{k}"/>'
+            f'<origin xyz="{0.2 * length if k else 0} 0 0"/><axis xyz="0 1 0"/>'
+            f'<limit lower="-3" upper="3" velocity="5" effort="{effort}"/></joint>'
+            for k, name in enumerate(("shoulder", "elbow", "wrist"))
+        )
+        + "</robot>"
+    )
+    for name in ("shoulder", "elbow", "wrist"):
+        change(folder / f"{name}.toml", r"\ntorque_max_Nm = \S+", f"\ntorque_max_Nm = {0.9 * effort}")
+    change(folder / "arm.toml", r"payload_kg = 1.0", "payload_kg = 0.0")
+    return remarks(folder)
+
+
+@pytest.mark.parametrize(
+    ("mass", "length", "said"),
+    [(1.0, 1.0, None), (0.2, 0.5, None), (4.0, 2.0, None), (1000.0, 1.0, "grams instead of kg"), (1.0, 25.0, None)],
+)
+def test_masses_in_grams_are_named(folder: Path, mass: float, length: float, said: str | None) -> None:
+    found = small(folder, mass, length)
+    assert ([said in line for line in found] == [True]) if said else found == []
+
+
+def test_a_fixed_joint_needs_no_axis(folder: Path) -> None:
+    path = folder / "arm.urdf"
+    path.write_text(path.read_text().replace("</robot>", '<link name="tool"/><joint name="flange" type="fixed">'
+        '<parent link="hand"/><child link="tool"/><axis xyz="0 0 0"/></joint></robot>'))  # fmt: skip
+    assert remarks(folder) == []
+
+
+def test_a_limit_of_a_whole_number_beyond_a_turn_is_named(folder: Path) -> None:
+    change(folder / "arm.urdf", r'lower="[^"]*"', 'lower="-10"')
+    assert [line for line in remarks(folder) if "limit lower (=-10) is more than a turn; degrees" in line]
+    change(folder / "arm.urdf", r'lower="[^"]*"', 'lower="-6.2831853"')
+    assert remarks(folder) == []

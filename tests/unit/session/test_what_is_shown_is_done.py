@@ -26,6 +26,7 @@ from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check,
 from jointctl.tools.inspection.motion_check import make_plan as check_plan
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
+from jointctl.tools.session import run_watch as run_watch_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
@@ -37,6 +38,7 @@ from jointctl.tools.verbs import scope as scope_module
 from tests.configurations import VIRTUAL, edited, written
 from tests.places import CONFIGS
 from tests.sessions import constants_of
+from tests.simulated_programs import at_once
 
 # --- Between what the user was shown and what the joint does nothing may change, and nothing may jump ---
 SHORT = ("duration_s = 10.0", "duration_s = 1.0")
@@ -142,7 +144,7 @@ class SilentLoop:
 @pytest.mark.parametrize("velocity", [False, True])
 @pytest.mark.parametrize("samples", [0, 300])
 def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
-    tmp_path: Path, samples: int, velocity: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, samples: int, velocity: bool
 ) -> None:
     config = edited(tmp_path)
     log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
@@ -153,8 +155,11 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     axis = plan.motion.placed(report()).constants[0]
     if velocity:
         axis.command_kind, axis.velocity_command.position_gain_ps = CommandKind.VELOCITY, POSITION_GAIN_ps
+    monkeypatch.setattr(run_watch_module, "beside", at_once)
     with RunWatch(plan, axis, parts) as watch:
         watch.check_delay()
+        assert not loop.may_enable
+        watch._may_enable()
     assert loop.may_enable is (samples > 0)
     assert (watch.delay_s is None) is (samples == 0)
     if samples:

@@ -133,19 +133,36 @@ def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
 
 
 @pytest.mark.trips(Fault.SAMPLES_MISSING, "(5, Fault.SAMPLES_MISSING)")
-@pytest.mark.stays(Fault.SAMPLES_MISSING, "(4, Fault.SUPERVISOR_LOST)")
-@pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.SUPERVISOR_LOST), (5, Fault.SAMPLES_MISSING)])
-def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cycles: int, fault: Fault) -> None:
+@pytest.mark.stays(Fault.SAMPLES_MISSING, "(4, Fault.NONE)")
+@pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.NONE), (5, Fault.SAMPLES_MISSING)])
+def test_the_wait_for_the_supervisors_word_does_not_count(
+    axis: Any, state: Any, settle_cycles: int, fault: Fault
+) -> None:
+    """How long it may be silent then: test_supervision_edges.py."""
     axis.sequence.may_enable, axis.sequence.settle_cycles = 0, settle_cycles
     settled(state)
+    state.phase_cycle = 41
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING if fault else AxisPhase.WAITING, fault)
+    assert state.fault_value == (settle_cycles if fault else 0.0)
+    assert state.fault_drive_error == (0x3310 if fault else 0)
+
+
+def test_samples_that_stay_away_while_the_supervisors_word_is_awaited_have_all_their_time(
+    axis: Any, state: Any
+) -> None:
+    axis.sequence.may_enable = 0
+    settled(state)
+    state.phase_cycle, state.held_up_cycles = 1000, 7
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert (state.phase_cycle, state.held_up_cycles) == (0, 0)
+    state.good_samples = 0
     state.phase_cycle = 40
-    step_waiting(axis, state, idle_sample())
+    step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
     state.phase_cycle = 41
     step_waiting(axis, state, sample_of(DriveState.OFF))
-    assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
-    assert state.fault_value == (41.0 if fault is Fault.SUPERVISOR_LOST else settle_cycles)
-    assert state.fault_drive_error == (0 if fault is Fault.SUPERVISOR_LOST else 0x3310)
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.SAMPLES_MISSING)
 
 
 @pytest.mark.trips(Fault.NO_SAMPLES, "(0, 0.0, 1, Fault.NO_SAMPLES, 0.0)")

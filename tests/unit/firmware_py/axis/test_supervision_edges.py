@@ -101,6 +101,21 @@ def test_a_limit_of_one_cycle_is_no_limit_of_zero_which_means_none(axis: Any, st
         assert state.fault == fault
 
 
+@pytest.mark.parametrize(
+    ("age_cycles", "supervised", "fault"),
+    [(40, 10, Fault.NONE), (41, 10, Fault.SUPERVISOR_LOST), (41, 1, Fault.SUPERVISOR_LOST), (1000, 0, Fault.NONE)],
+)
+def test_before_enabling_the_supervisor_may_be_silent_for_the_time_of_the_wait(
+    axis: Any, state: Any, age_cycles: int, supervised: int, fault: Fault
+) -> None:
+    axis.sequence.wait_max_cycles, axis.sequence.supervisor_max_cycles = 40, supervised
+    sample = new(Sample)[0]
+    sample.drive_state, sample.drive_error = DriveState.OFF, 0x2310
+    check_supervision(axis, state, sample, 0, age_cycles)
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING if fault else AxisPhase.WAITING, fault)
+    assert (state.fault_value, state.fault_drive_error) == (age_cycles if fault else 0, 0)
+
+
 @pytest.mark.parametrize("limit", ["heartbeat_age_max_cycles", "supervisor_max_cycles"])
 def test_what_is_not_watched_does_not_trip(axis: Any, state: Any, limit: str) -> None:
     sample = new(Sample)[0]

@@ -1,0 +1,193 @@
+"""`new --arm --urdf`: the files of an arm of one's own, which check, hil and run take as they are."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.analysis.arm_check import joint_loops, pose_ranges, require_budgets
+from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+from jointctl.tools.configuration.canopen import canopen_section
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.lockstep import LockstepArm
+from jointctl.tools.verbs.new import DriveOptions, new
+from tests.arms import long_arm
+from tests.sessions import output
+
+_LINK = (
+    '<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="{mass}"/>'
+    '<inertia ixx="{i}" ixy="0" ixz="0" iyy="{i}" iyz="0" izz="{i}"/></inertial></link>'
+)
+
+
+def robot(joints: str, masses: tuple[float, ...] = (3.0, 2.0)) -> str:
+    links = "".join(_LINK.format(name=f"l{k + 1}", mass=mass, i=0.02 * mass) for k, mass in enumerate(masses))
+    return f'<robot name="r"><link name="base"/>{links}{joints}</robot>'
+
+
+def joint(k: int, limit: str, kind: str = "revolute", name: str = "") -> str:
+    parent = "base" if k == 1 else f"l{k - 1}"
+    return (
+        f'<joint name="{name or f"j{k}"}" type="{kind}"><parent link="{parent}"/><child link="l{k}"/>'
+        f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/>{limit}</joint>'
+    )
+
+
+LIMIT = '<limit lower="-1.2" upper="2.5" velocity="2.0" effort="{effort}"/>'
+TURNS = '<limit velocity="3.0" effort="20"/>'
+GOOD = robot(joint(1, LIMIT.format(effort=60)) + joint(2, TURNS, "continuous"))
+
+
+def made(folder: Path, text: str, joints: str = "") -> Path:
+    urdf = folder / "own robot.urdf"
+    urdf.write_text(text)
+    out, _, _ = output()
+    assert new(folder / "arm", out, arm=True, urdf=urdf, joints=joints, no_input=True) == 0
+    return folder / "arm" / "arm.toml"
+
+
+def test_what_the_urdf_says_is_in_the_files(tmp_path: Path) -> None:
+    path = made(tmp_path, GOOD)
+    assert (path.parent / "own robot.urdf").read_text() == GOOD
+    arm = load_arm(path)
+    assert arm.names == ("j1", "j2")
+    first, second = (load_config(path.parent / f"{name}.toml") for name in arm.names)  # each alone as well
+    limits = first.limits
+    assert (limits.position_min_rad, limits.position_max_rad) == (-1.2, 2.5)
+    assert (limits.velocity_max_radps, limits.torque_max_Nm) == (2.0, 60.0)
+    assert (second.limits.velocity_max_radps, second.limits.torque_max_Nm) == (3.0, 20.0)
+    assert -math.pi < second.limits.position_min_rad < -3.0
+    assert [canopen_section(config).node for config in arm.joints] == [1, 2]
+    for config, found in zip(arm.joints, pose_ranges(arm), strict=True):
+        assert found.least_kgm2 * 0.999 <= config.joint.inertia_kgm2 <= found.greatest_kgm2 * 1.001
+        drive = canopen_section(config)
+        at_joint_Nm = drive.rated_torque_Nm * config.joint.reduction_ratio * drive.max_torque_permille / 1000
+        assert config.limits.torque_max_Nm <= at_joint_Nm <= 1.02 * config.limits.torque_max_Nm
+
+
+def test_its_loops_have_their_margins_and_it_moves_in_lockstep(tmp_path: Path) -> None:
+    arm = load_arm(made(tmp_path, GOOD))
+    require_budgets(arm)
+    for loop in joint_loops(arm):
+        assert loop.margins.stable
+        assert loop.margins.phase_margin_deg >= loop.config.margin.min_phase_margin_deg
+    lockstep = LockstepArm(arm)
+    constants = lockstep.constants()
+    constants.trajectory.duration_s[:] = 3.0
+    for run in lockstep.run(constants):
+        assert run.fault is Fault.NONE
+        assert np.max(np.abs(run.true_error_rad[run.tracking])) < 2e-3
+
+
+@pytest.mark.parametrize("effort", [1.5, 400.0])
+def test_whatever_the_effort_the_gains_suit_the_poses(tmp_path: Path, effort: float) -> None:
+    text = robot(joint(1, LIMIT.format(effort=effort)), (effort / 100.0,))
+    (loop,) = joint_loops(load_arm(made(tmp_path, text)))
+    assert loop.margins.phase_margin_deg >= loop.config.margin.min_phase_margin_deg
+
+
+def test_seven_joints_get_the_rate_that_one_bus_carries(tmp_path: Path) -> None:
+    (tmp_path / "long").mkdir()
+    arm = load_arm(made(tmp_path, (long_arm(tmp_path / "long").parent / "arm.urdf").read_text()))
+    assert arm.rate_Hz == 500.0
+    require_budgets(arm)
+    assert len({canopen_section(config).node for config in arm.joints}) == 7
+
+
+def test_joints_that_are_not_named_stand_at_0(tmp_path: Path) -> None:
+    arm = load_arm(made(tmp_path, GOOD, joints="j1"))
+    assert arm.names == ("j1",)
+    assert any("j2" in remark and "stands at 0" in remark for remark in arm.remarks)
+
+
+def test_names_that_are_no_file_names(tmp_path: Path) -> None:
+    odd = 'a/"b"\u00e9 ..'
+    limit = LIMIT.format(effort=60)
+    text = robot(joint(1, limit, name="arm") + joint(2, limit, name=odd.replace('"', "&quot;")))
+    arm = load_arm(made(tmp_path, text))
+    assert arm.names == ("arm", odd)
+    assert all(config.path.parent == tmp_path / "arm" for config in arm.joints)
+    assert len({config.path.name.lower() for config in arm.joints} | {"arm.toml"}) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "joints", "said"),
+    [
+        (robot(joint(1, LIMIT.format(effort=0)), (1.0,)), "", "joint j1: limit effort (=0) must be above 0"),
+        (robot(joint(1, '<limit lower="-1" upper="1"/>'), (1.0,)), "", "<limit> must have velocity, effort"),
+        (robot(joint(1, ""), (1.0,)), "", "<limit> must have lower, upper, velocity, effort"),
+        (robot(joint(1, LIMIT.format(effort=9), "prismatic"), (1.0,)), "", "0 joints turn, must be 1 to 16"),
+        (robot(joint(1, LIMIT.format(effort=9)), (1.0,)), "j7", "j7 must be a joint of own robot.urdf that turns"),
+        (robot(joint(1, LIMIT.format(effort=9)), (1.0,)), "j1,j1", "must not name a joint twice"),
+        (GOOD.replace('<link name="l2">', '<link name="l2"/><link name="l9">'), "", "one link must have no joint"),
+        ("no xml", "", "not valid XML"),
+    ],
+)
+def test_what_makes_no_arm_is_said_in_one_line_and_nothing_is_written(
+    tmp_path: Path, text: str, joints: str, said: str
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        made(tmp_path, text, joints)
+    assert said in str(caught.value)
+    assert ("--joints" if joints else "own robot.urdf") in str(caught.value)
+    assert not (tmp_path / "arm").exists()
+
+
+def test_it_overwrites_nothing_and_its_options_go_together(tmp_path: Path) -> None:
+    path, (out, _, _) = made(tmp_path, GOOD), output()
+    before = path.read_bytes()
+    urdf = tmp_path / "own robot.urdf"
+    with pytest.raises(DataError, match="exists already"):
+        new(path.parent, out, arm=True, urdf=urdf, no_input=True)
+    assert path.read_bytes() == before
+    with pytest.raises(UsageError, match="--arm"):
+        new(tmp_path / "x.toml", out, urdf=urdf)
+    with pytest.raises(UsageError, match="--urdf"):
+        new(tmp_path / "x", out, arm=True, joints="j1")
+    with pytest.raises(UsageError, match="no drive"):
+        new(tmp_path / "x", out, arm=True, urdf=urdf, drive=DriveOptions(node=1))
+    with pytest.raises(UsageError, match="no terminal"):
+        new(tmp_path / "x", out, arm=True, urdf=urdf)
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        new(tmp_path / "x", out, arm=True, urdf=tmp_path / "none.urdf", no_input=True)
+    with pytest.raises(ConfigurationError, match="must be a URDF file"):
+        new(tmp_path / "x", out, arm=True, urdf=SHIPPED_ARM, no_input=True)
+
+
+def test_questions_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    urdf = tmp_path / "own.urdf"
+    urdf.write_text(GOOD)
+    stdin = io.StringIO("7\n\n-3\nmany\n9\n0.5\n")
+    stdin.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdin", stdin)
+    out, _, err = output()
+    assert new(tmp_path / "arm", out, arm=True, urdf=urdf) == 0
+    arm = load_arm(tmp_path / "arm" / "arm.toml")
+    assert [canopen_section(config).node for config in arm.joints] == [7, 9]
+    assert arm.arm.motor_inertia_kgm2 is not None
+    assert np.allclose(arm.arm.motor_inertia_kgm2, (1.2 * 60.0 / 145.0, 0.5), rtol=5e-3)
+    said = err.getvalue()
+    assert re.search(r"drive.node \(=-3\)", said)
+    assert "drive.node (=many)" in said
+
+
+def test_two_joints_with_one_node_are_refused_with_the_names_of_the_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    urdf = tmp_path / "own.urdf"
+    urdf.write_text(GOOD)
+    stdin = io.StringIO("7\n\n7\n\n")
+    stdin.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdin", stdin)
+    out, _, _ = output()
+    with pytest.raises(ConfigurationError, match=r"arm/arm\.toml: j2\.toml: drive\.node \(=7\) must differ"):
+        new(tmp_path / "arm", out, arm=True, urdf=urdf)
+    assert not (tmp_path / "arm").exists()
