@@ -38,6 +38,8 @@ TORQUE_SWINGS = 4
 ERROR_SWINGS = 6
 GROWING_SWINGS = 8
 REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
+ROUNDING_rad = 1e-12  # of a desired position: a motion that ends at a limit is not beyond it
+LOOK_AHEAD_rad = 1e-5  # at most so much is allowed for the jerk of a desired motion that comes to rest at a limit
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 PUSHED_CYCLES = 20  # at a torque that a healthy joint gives way to: it moves by a milliradian in that time
 
@@ -226,13 +228,30 @@ def check_suspension(state: AxisState, suspended_s: float) -> None:
 
 @kernel
 def reference_fault(
-    limits: LimitConstants, position_rad: float, velocity_radps: float, brake_radps2: float, ahead_s: float
+    limits: LimitConstants,
+    position_rad: float,
+    velocity_radps: float,
+    acceleration_radps2: float,
+    jerk_radps3: float,
+    brake_radps2: float,
+    ahead_s: float,
 ) -> Fault:
-    """Fault of the desired motion: braked `ahead_s` from now, it must come to rest inside the position limits."""
-    stop_rad = position_rad + velocity_radps * (ahead_s + 0.5 * abs(velocity_radps) / brake_radps2)
-    if not within(position_rad, limits.position_min_rad, limits.position_max_rad):
+    """Fault of the desired motion: braked `ahead_s` from now, it must come to rest inside the position limits.
+
+    Until then it goes on as it is: at its velocity, or slowing down as it does already, so that a motion may end at a
+    limit; how far its jerk takes it from that is allowed for, as far as `LOOK_AHEAD_rad`.
+    """
+    speed_radps = abs(velocity_radps)
+    slowing_radps2 = max(-math.copysign(1.0, velocity_radps) * acceleration_radps2, 0.0)
+    slowing_s = speed_radps / slowing_radps2 if slowing_radps2 * ahead_s > speed_radps else ahead_s
+    later_radps = speed_radps - slowing_radps2 * slowing_s
+    way_rad = 0.5 * (speed_radps + later_radps) * slowing_s + 0.5 * later_radps * later_radps / brake_radps2
+    stop_rad = position_rad + math.copysign(way_rad, velocity_radps)
+    low_rad, high_rad = limits.position_min_rad - ROUNDING_rad, limits.position_max_rad + ROUNDING_rad
+    if not within(position_rad, low_rad, high_rad):
         return Fault.REFERENCE_LIMIT
-    if not within(stop_rad, limits.position_min_rad, limits.position_max_rad):
+    turning_rad = min(abs(jerk_radps3) * ahead_s * ahead_s * ahead_s, LOOK_AHEAD_rad)
+    if not within(stop_rad, low_rad - turning_rad, high_rad + turning_rad):
         return Fault.REFERENCE_LIMIT
     if not within(velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
         return Fault.REFERENCE_LIMIT
@@ -247,6 +266,8 @@ def check_reference(constants: AxisConstants, state: AxisState) -> None:
         constants.limits,
         reference.position_rad,
         reference.velocity_radps,
+        reference.acceleration_radps2,
+        reference.jerk_radps3,
         constants.sequence.brake_radps2,
         REACTION_CYCLES * constants.law.period_s,
     )
@@ -284,7 +305,7 @@ def set_point_problem(
         speed_radps = before.velocity_radps + d * (2.0 * c2 + 3.0 * d * c3)
         if not within(speed_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
             return SetPointProblem.VELOCITY
-        if reference_fault(limits, way_rad, speed_radps, brake_radps2, stream.delay_ns * 1e-9) != Fault.NONE:
+        if reference_fault(limits, way_rad, speed_radps, 0.0, 0.0, brake_radps2, stream.delay_ns * 1e-9) != Fault.NONE:
             return SetPointProblem.STOPPING_WAY
     return SetPointProblem.NONE
 

@@ -194,7 +194,8 @@ def test_the_terminal_is_told_when_the_last_page_closes(bench: Any, browser: Bro
     assert bench.disabled()
 
 
-KEYS = {"Escape": (27, "Escape"), "Space": (32, " ")}
+# number, text and code of a key; a keyboard on a screen or from afar may have no code
+KEYS = {"Escape": (27, "Escape", "Escape"), "Space": (32, " ", "Space"), "Space without a code": (32, " ", "")}
 # what every text has against what is behind it; WCAG 2.2, 1.4.3: 4.5, 3 for large or bold text
 CONTRASTS = """(() => {
   const linear = v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
@@ -220,15 +221,17 @@ CONTRASTS = """(() => {
 
 
 def press(tab: Tab, key: str, *, held: int = 0) -> None:
-    code, text = KEYS[key]
-    event = {"code": key, "key": text, "windowsVirtualKeyCode": code}
+    number, text, code = KEYS[key]
+    event = {"code": code, "key": text, "windowsVirtualKeyCode": number}
     tab.call("Input.dispatchKeyEvent", type="keyDown", **event)
     for _ in range(held):
         tab.call("Input.dispatchKeyEvent", type="keyDown", autoRepeat=True, **event)
     tab.call("Input.dispatchKeyEvent", type="keyUp", **event)
 
 
-@pytest.mark.parametrize(("key", "focus"), [("Escape", "set-point"), ("Space", "record"), ("Space", "set-point")])
+@pytest.mark.parametrize(("key", "focus"), [
+    ("Escape", "set-point"), ("Space", "record"), ("Space", "set-point"), ("Space without a code", "signals"),
+])  # fmt: skip
 def test_a_key_stops_from_anywhere(bench: Any, browser: Browser, key: str, focus: str) -> None:
     _, tab, _ = opened(bench, browser)
     start(tab)
@@ -278,6 +281,10 @@ def test_a_refused_set_point_is_told_at_its_field(bench: Any, browser: Browser) 
     tab.click("go")
     field = "document.querySelector('[data-testid=\"set-point\"]').closest('.q-field')"
     tab.until(f"{field}.innerText.includes('must be in')")
+    tab.click("dark")
+    tab.until("document.body.classList.contains('body--dark')")
+    time.sleep(1.0)  # colours fade
+    assert tab.js(CONTRASTS) == ""
     tab.enter("set-point", "0.1")
     tab.until(f"!{field}.innerText.includes('must be in')")
 

@@ -28,6 +28,7 @@ AFTER_TRIGGER = 0.5  # share of the span that is shown after the trigger
 COLOURS = ("#1f5fa8", "#b85c0c", "#2e7d52", "#a8323e", "#6a51a3", "#5f6b76")  # on white
 DARK_COLOURS = ("#6fa8e8", "#f0a35e", "#6fce9b", "#ef8791", "#b7a3ea", "#b4bec8")  # on nearly black
 _TEXT, _DARK_TEXT = "#333333", "#dddddd"
+_GRID, _DARK_GRID = "#dde2e8", "#3b4148"
 # an axis shows at least so much: the noise of a joint at rest is no motion
 LEAST_SPAN = {"[mrad]": 0.2, "[rad]": 2e-3, "[rad/s]": 0.02, "[Nm]": 0.2, "[us]": 20.0}
 # a click where no cursor was set longer ago than the other's sets it; the chart is there some time after the page
@@ -52,8 +53,8 @@ _AXIS = {
     "scale": True,
     "axisLine": {"onZero": False},
     "nameTextStyle": {"fontSize": 12},
-    "splitLine": {"lineStyle": {"width": 0.6}},
 }
+_POWERS = {":formatter": "value => value.toExponential(0)"}  # of ten, as the ticks of a spectrum
 
 
 def axis_range(low: float, high: float, unit: str) -> tuple[float, float] | None:
@@ -174,6 +175,7 @@ class Chart:
 
     def dark(self, on: bool) -> None:
         self._colours, text = (DARK_COLOURS, _DARK_TEXT) if on else (COLOURS, _TEXT)
+        self._grid = {"lineStyle": {"width": 0.6, "color": _DARK_GRID if on else _GRID}}
         self._behind = _DARK_BEHIND if on else _BEHIND
         options, plain = self._chart.options, {"color": text}
         options["textStyle"], options["legend"]["textStyle"] = plain, plain
@@ -233,11 +235,12 @@ class Chart:
         self._seen, chosen, names = found, (view, names), list(series)
         units = list(dict.fromkeys(name[name.index("[") :] for name in names))
         options, plain = self._chart.options, {"color": self._text}
-        options["xAxis"]["name"] = "s" if over_time else found.x_name
+        options["xAxis"] |= {"name": "s" if over_time else found.x_name, **x_ends(view, found)}
         log = {"type": "log", "min": None, "max": None} if view == SPECTRUM else None
         options["yAxis"] = [
             {**_AXIS, **(log or axis_ends(unit, series)), "name": unit, "position": "left" if i == 0 else "right",
-             "offset": max(0, i - 1) * 56, "axisLabel": plain, "nameTextStyle": {"fontSize": 12, **plain}}
+             "offset": max(0, i - 1) * 56, "axisLabel": {**plain, **(_POWERS if log else {})},
+             "splitLine": self._grid, "nameTextStyle": {"fontSize": 12, **plain}}
             for i, unit in enumerate(units or [""])
         ]  # fmt: skip
         options["grid"]["right"] = 24 + 56 * max(0, len(units) - 1)
@@ -264,6 +267,17 @@ def axis_ends(unit: str, series: Mapping[str, Sequence[Sequence[float | None]]])
     found = axis_range(min(values), max(values), unit) if values and unit else None
     low, high = found or (None, None)
     return {"min": low, "max": high}
+
+
+def x_ends(view: str, found: Seen) -> dict[str, Any]:
+    """`min` and `max` of the axis across: that of a signal has the least span of its unit as well."""
+    values = found.x[np.isfinite(found.x)] if view == AGAINST else []
+    if len(values):
+        unit = found.x_name[found.x_name.index("[") :]
+        ends = axis_range(float(np.min(values)), float(np.max(values)), unit)
+        if ends is not None:
+            return {"min": ends[0], "max": ends[1]}
+    return {"min": "dataMin", "max": "dataMax"}
 
 
 def _options() -> dict[str, Any]:

@@ -44,17 +44,18 @@ _PRESSED = """window.jointctlStop = () => {
 # it then.  A key that is held down is one press.
 _WATCH = """<script>
 PRESSED
+const isSpace = event => event.key === ' ' || event.code === 'Space'
 document.addEventListener('keydown', event => {
   const beat = document.querySelector('[data-testid="beat"]')
   const moves = beat && beat.textContent.endsWith('MOVES')
-  if (event.key !== 'Escape' && !(moves && event.code === 'Space')) return
+  if (event.key !== 'Escape' && !(moves && isSpace(event))) return
   event.preventDefault()
   event.stopImmediatePropagation()
   if (!event.repeat) window.jointctlStop()
 }, true)
 document.addEventListener('keyup', event => {
   const beat = document.querySelector('[data-testid="beat"]')
-  if (event.code !== 'Space' || !beat || !beat.textContent.endsWith('MOVES')) return
+  if (!isSpace(event) || !beat || !beat.textContent.endsWith('MOVES')) return
   event.preventDefault()
   event.stopImmediatePropagation()
 }, true);
@@ -281,6 +282,8 @@ class ChangePanels:
         """Gains appear when the supervisor tells them; what the viewer has typed stays."""
         gains: Mapping[str, Any] = settings.get("gains", {})
         self._column.visible = settings.get("stage") == "running" and bool(gains)
+        if not self._column.visible:
+            self._forget_refusals()
         if set(gains) != set(self._gains):
             self._gain_rows.clear()
             self._gains = {}
@@ -307,6 +310,12 @@ class ChangePanels:
             return
         for field in refused_fields(str(refused["text"]), self._fields_of(self._asked)):
             field.error = str(refused["text"])
+
+    def _forget_refusals(self) -> None:
+        """The run that they are about has ended."""
+        for kind in ("set_point", "trajectory", "gains"):
+            for field in self._fields_of(kind).values():
+                field.error = None
 
     def _fields_of(self, kind: str) -> dict[str, Any]:
         if kind == "set_point":
@@ -355,6 +364,7 @@ CSS = (
     " .body--dark .scope-head{background:#121212} .scope-aside{color:#5f5f5f} .body--dark .scope-aside{color:#b0b0b0}"
     # what is refused takes as many lines as it needs, below its field
     " .q-field--with-bottom{padding-bottom:0} .q-field__bottom--animated{position:static; transform:none}"
+    " .body--dark .q-field--error .text-negative{color:#ff8a80 !important}"
     " .scope-bad{color:#c62828; font-weight:600} .body--dark .scope-bad{color:#ff8a80}"
     " :focus-visible{outline:3px solid #1f5fa8; outline-offset:2px} .body--dark :focus-visible{outline-color:#6fa8e8}"
     " @media (max-width: 900px) {.scope-body{flex-wrap:wrap} .scope-body>*{width:100%}}"

@@ -35,9 +35,15 @@ BUILD = "import sys, setuptools.build_meta as b; getattr(b, 'build_' + sys.argv[
 
 def build(kind: str, tree: Path, out: Path) -> Path:
     """The archive that the build back end makes of a tree."""
-    subprocess.run(
-        [sys.executable, "-c", BUILD, kind, str(out)], cwd=tree, check=True, capture_output=True, timeout=120.0
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, kind, str(out)],
+        cwd=tree,
+        check=True,
+        capture_output=True,
+        timeout=120.0,
+        text=True,
     )
+    assert "would be ignored" not in done.stderr  # a folder that is no package of pyproject.toml
     (archive,) = out.iterdir()
     return archive
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from jointctl.tools.recording.run_log import INFO, Event
 from jointctl.tools.scoping import feed as feed_module
 from jointctl.tools.scoping import server as server_module
 from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed, ScopeOrder, scope_order
-from jointctl.tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
+from jointctl.tools.scoping.history import EVENTS, POINTS, SIGNALS, History, Seen, crossing_s, percentiles_us
 from jointctl.tools.scoping.server import COOKIE, allowed, cookie_name
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
@@ -537,6 +538,19 @@ def test_refusals_of_others_and_of_before_are_not_shown() -> None:
     assert page.errors() == ("no", None, None, None)
 
 
+def test_what_was_refused_in_a_run_that_has_ended_is_forgotten() -> None:
+    page = Asking()
+    page.panels._refusals = 0
+    for count, kind in enumerate(("set_point", "trajectory", "gains"), 1):
+        page.panels._ask(kind, {})
+        page.refused(kind, count)
+    assert page.errors() == ("no",) * 4
+    page.panels._column = SimpleNamespace(visible=True)
+    page.panels._gain_rows, page.panels._record, page.panels._recorded = MagicMock(), MagicMock(), MagicMock()
+    page.panels.show({"stage": "ended"})
+    assert page.errors() == (None,) * 4
+
+
 # --- The axis of a joint at rest ---
 @pytest.mark.parametrize(
     ("low", "high", "unit", "fits_itself"),
@@ -561,6 +575,19 @@ def test_an_axis_follows_its_signals_again_once_they_move() -> None:
     # named, though there are none: a chart keeps what it is not given
     assert chart.axis_ends("[rad]", {"angle [rad]": motion}) == {"min": None, "max": None}
     assert chart.axis_ends("[Nm]", {"angle [rad]": rest}) == {"min": None, "max": None}
+
+
+def test_neither_does_the_axis_across_magnify_a_joint_at_rest() -> None:
+    chart = pytest.importorskip("jointctl.tools.scoping.chart")
+
+    def across(view: str, *angles_rad: float) -> dict[str, Any]:
+        return dict(chart.x_ends(view, Seen("angle [rad]", np.array([np.nan, *angles_rad]), {})))
+
+    resting = across("x-y", 0.1, 0.10001)
+    assert resting["min"] < 0.1 < 0.10001 < resting["max"]
+    assert resting["max"] - resting["min"] == pytest.approx(1.5 * chart.LEAST_SPAN["[rad]"])
+    fits = {"min": "dataMin", "max": "dataMax"}
+    assert across("x-y", 0.1, 0.35) == across("x-y") == across("time", 0.1, 0.10001) == fits
 
 
 def test_every_signal_has_a_least_span() -> None:

@@ -41,6 +41,18 @@ def test_a_set_point_is_reached_from_rest_inside_the_speed_of_moves(rig: NewRig)
     assert run.state.fault == Fault.NONE
 
 
+@pytest.mark.parametrize("limit_rad", [-1.0, 1.0])
+def test_a_set_point_may_be_a_limit_itself(rig: NewRig, limit_rad: float) -> None:
+    run = live(rig(0.0))
+    assert (run.axis.limits.position_min_rad, run.axis.limits.position_max_rad) == (-1.0, 1.0)
+    run.until(AxisPhase.TRACKING).run(50)
+    assert answered(run, hold(run, limit_rad)) is ChangeAnswer.TAKEN
+    while run.state.change.motion != MotionChange.NONE and run.phase is AxisPhase.TRACKING:
+        run.tick()
+    assert run.state.fault == Fault.NONE
+    assert run.state.reference.position_rad == limit_rad
+
+
 def test_a_stop_brakes_from_wherever_the_move_is(rig: NewRig) -> None:
     for after in (1, 10, 60, 200):
         run = live(rig(0.0)).until(AxisPhase.TRACKING).run(50)

@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import LimitConstants
 from jointctl.firmware_py.safety import (
+    ROUNDING_rad,
     drive_fault,
     encoders_disagree,
     limit_position_rad,
@@ -22,7 +25,8 @@ from jointctl.firmware_py.safety import (
     within,
 )
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction, TrajectoryKind
+from jointctl.firmware_py.trajectory import NO_TABLE, reference_at, trapezoid_times_s
 
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 
@@ -41,8 +45,20 @@ LIMITED: list[tuple[str, Fault, float, float, Check]] = [
     ("position", Fault.POSITION_LIMIT, -0.5, 0.7, lambda v: motion_fault(LIMITS, v, 0.0, 0.0)),
     ("velocity", Fault.VELOCITY_LIMIT, -1.5, 1.5, lambda v: motion_fault(LIMITS, 0.0, v, 0.0)),
     ("error", Fault.FOLLOWING_ERROR, -0.05, 0.05, lambda v: motion_fault(LIMITS, 0.0, 0.0, v)),
-    ("reference position", Fault.REFERENCE_LIMIT, -0.5, 0.7, lambda v: reference_fault(LIMITS, v, 0.0, 2.0, 0.1)),
-    ("reference velocity", Fault.REFERENCE_LIMIT, -1.5, 1.5, lambda v: reference_fault(LIMITS, 0.0, v, 1e9, 0.0)),
+    (
+        "reference position",
+        Fault.REFERENCE_LIMIT,
+        -0.5 - ROUNDING_rad,
+        0.7 + ROUNDING_rad,
+        lambda v: reference_fault(LIMITS, v, 0.0, 0.0, 0.0, 2.0, 0.1),
+    ),
+    (
+        "reference velocity",
+        Fault.REFERENCE_LIMIT,
+        -1.5,
+        1.5,
+        lambda v: reference_fault(LIMITS, 0.0, v, 0.0, 0.0, 1e9, 0.0),
+    ),
 ]
 
 
@@ -198,9 +214,65 @@ def test_a_reference_must_be_able_to_brake_inside_the_limits(sign: float, past_r
     velocity, brake, ahead = 1.2, 4.0, 0.002
     edge = LIMITS.position_max_rad if sign > 0.0 else LIMITS.position_min_rad
     position = edge - sign * (velocity * ahead + velocity**2 / (2.0 * brake) - past_rad)
-    assert reference_fault(LIMITS, position, sign * velocity, brake, ahead) == fault
+    for gaining in (0.0, 3.0):  # what it gains in speed until it is braked is the acceleration limit's business
+        assert reference_fault(LIMITS, position, sign * velocity, sign * gaining, 0.0, brake, ahead) == fault
     # moving away from that limit, the same place is no danger
-    assert reference_fault(LIMITS, position, -sign * 0.1, brake, ahead) == Fault.NONE
+    assert reference_fault(LIMITS, position, -sign * 0.1, 0.0, 0.0, brake, ahead) == Fault.NONE
+
+
+def test_no_jerk_takes_a_reference_far_beyond_a_limit() -> None:
+    velocity, brake, ahead, limit = 1.2, 4.0, 0.002, LIMITS.position_max_rad
+    way = velocity * ahead + velocity**2 / (2.0 * brake)
+    for jerk, past_rad, fault in (
+        (1e9, 1.01e-5, Fault.REFERENCE_LIMIT), (1e9, 0.99e-5, Fault.NONE), (-100.0, 0.99 * 8e-7, Fault.NONE),
+        (-100.0, 1.01 * 8e-7, Fault.REFERENCE_LIMIT), (math.nan, 1.0, Fault.REFERENCE_LIMIT),
+    ):  # fmt: skip
+        assert reference_fault(LIMITS, limit - way + past_rad, velocity, 0.0, jerk, brake, ahead) == fault
+    assert reference_fault(LIMITS, limit + 2.0 * ROUNDING_rad, 0.0, 0.0, 1e9, brake, ahead) == Fault.REFERENCE_LIMIT
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("past_rad", "fault"), [(-1e-9, Fault.NONE), (1e-9, Fault.REFERENCE_LIMIT)])
+@pytest.mark.parametrize("velocity", [1.2, 0.02])  # 0.02: at rest before it would be braked
+def test_a_reference_that_slows_down_is_braked_from_where_it_is_then(
+    sign: float, past_rad: float, fault: Fault, velocity: float
+) -> None:
+    slowing, brake, ahead = 20.0, 4.0, 0.002
+    later = max(velocity - slowing * ahead, 0.0)
+    way = (velocity**2 - later**2) / (2.0 * slowing) + later**2 / (2.0 * brake)
+    edge = LIMITS.position_max_rad if sign > 0.0 else LIMITS.position_min_rad
+    position = edge - sign * (way - past_rad)
+    assert reference_fault(LIMITS, position, sign * velocity, -sign * slowing, 0.0, brake, ahead) == fault
+
+
+@pytest.mark.parametrize("beyond_rad", [0.0, 1e-9])
+@pytest.mark.parametrize("kind", [TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID, TrajectoryKind.SINE])
+def test_a_motion_may_end_at_a_limit_and_no_farther(kind: TrajectoryKind, beyond_rad: float) -> None:
+    """As the cycles see it: a trapezoid with half the deceleration of the brake at most, the others with all of it."""
+    random = np.random.default_rng(230)
+    limits, c, reference, brake = limit_constants(), new(TrajectoryConstants)[0], new(Reference)[0], 20.0
+    for limit, distance, hard in zip(
+        random.uniform(-3.0, 3.0, 30), random.uniform(0.01, 3.0, 30), random.uniform(0.1, 1.0, 30), strict=True
+    ):
+        limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = limit - 10.0, limit, 100.0
+        acceleration = hard * brake * (0.5 if kind is TrajectoryKind.TRAPEZOID else 1.0)
+        c.kind, c.start_rad, c.target_rad = kind, limit - distance, limit + beyond_rad
+        c.speed_radps, c.acceleration_radps2 = 0.3 * math.sqrt(distance * acceleration), acceleration
+        c.amplitude_rad, c.offset_rad = 0.5 * distance, limit + beyond_rad - 0.5 * distance
+        c.omega_radps = math.sqrt(2.0 * acceleration / distance)
+        ramp_s, cruise_s = trapezoid_times_s(distance, c.speed_radps, acceleration)
+        c.move_s = math.sqrt(5.7736 * distance / acceleration)
+        trapezoid_s, crest_s = 2.0 * ramp_s + cruise_s, 0.5 * math.pi / c.omega_radps
+        end_s = {TrajectoryKind.MIN_JERK: c.move_s, TrajectoryKind.TRAPEZOID: trapezoid_s}.get(kind, crest_s)
+        found = set()
+        for t_s in (*np.linspace(0.0, end_s, 100), *(end_s + random.uniform(0.0, 1e-3) + 1e-3 * np.arange(-30, 5))):
+            reference_at(c, NO_TABLE, 0, float(t_s), reference)
+            motion = reference.position_rad, reference.velocity_radps, reference.acceleration_radps2
+            found.add(reference_fault(limits, *map(float, motion), float(reference.jerk_radps3), brake, 2e-3))
+        if beyond_rad == 0.0:
+            assert found == {Fault.NONE}, (limit, distance, hard)
+        else:
+            assert Fault.REFERENCE_LIMIT in found
 
 
 # --- two encoders ---

@@ -353,7 +353,7 @@ def test_the_way_between_two_set_points_is_that_of_hermites_cubic() -> None:
             if abs(speed_radps) > 1.0:
                 expected = Problem.VELOCITY
                 break
-            if reference_fault(limits, float(cubic(at_s)), speed_radps, 20.0, DELAY_ms * 1e-3) != Fault.NONE:
+            if reference_fault(limits, float(cubic(at_s)), speed_radps, 0.0, 0.0, 20.0, DELAY_ms * 1e-3) != Fault.NONE:
                 expected = Problem.STOPPING_WAY
                 break
         points = ((start_rad, speeds_radps[0], 0.0), (start_rad + way_rad, speeds_radps[1], 0.0))
