@@ -372,12 +372,17 @@ def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
     return False
 
 
-@contextlib.contextmanager
-def starting() -> Iterator[None]:
-    """Marked as `STARTING`, until it has the lock of a bus or the block ends."""
+def mark_starting() -> None:
+    """As `STARTING`, until it has the lock of a bus."""
     if hasattr(os, "memfd_create"):
         with contextlib.suppress(OSError):  # as in `no_longer_starting`
             os.memfd_create(STARTING)
+
+
+@contextlib.contextmanager
+def starting() -> Iterator[None]:
+    """Marked so, until it has the lock of a bus or the block ends."""
+    mark_starting()
     try:
         yield
     finally:

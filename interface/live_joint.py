@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.bus_lock import starting
+from jointctl.drivers.bus_lock import no_longer_starting, starting
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -120,6 +120,8 @@ class LiveMotor:
         self.constants: Any = None
         self.axis: Any = None
         self.tables = np.zeros((0, 0, 5))
+        if source.own_virtual:  # no one else knows that bus
+            no_longer_starting()
 
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
