@@ -364,7 +364,7 @@ CSS = (
     " .body--dark .scope-head{background:#121212} .scope-aside{color:#5f5f5f} .body--dark .scope-aside{color:#b0b0b0}"
     # what is refused takes as many lines as it needs, below its field
     " .q-field--with-bottom{padding-bottom:0} .q-field__bottom--animated{position:static; transform:none}"
-    " .body--dark .q-field--error .text-negative{color:#ff8a80 !important}"
+    " .body--dark .q-field--error{--q-negative:#ff8a80}"
     " .scope-bad{color:#c62828; font-weight:600} .body--dark .scope-bad{color:#ff8a80}"
     " :focus-visible{outline:3px solid #1f5fa8; outline-offset:2px} .body--dark :focus-visible{outline-color:#6fa8e8}"
     " @media (max-width: 900px) {.scope-body{flex-wrap:wrap} .scope-body>*{width:100%}}"
