@@ -51,7 +51,7 @@ def between(low: float, high: float, *, open_low: bool = False) -> Any:
     return AfterValidator(Rule(interval, check))
 
 
-LEAST = 1e-30  # of a number that is not zero: with what is smaller nothing can be computed
+LEAST = 1e-18  # of a number that is not zero: with what is smaller nothing can be computed
 
 
 def _not_vanishing(value: Any) -> Any:

@@ -55,8 +55,14 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
 
 def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
     """Below it a margin would be an error of the linear algebra, above it is one."""
-    path = written(tmp_path / "joint.toml", joint__inertia_kgm2=1e-30)
+    path = written(tmp_path / "joint.toml", joint__inertia_kgm2=1e-18)
     with pytest.raises(MarginError, match="unstable"):
+        require_margin(load_config(path))
+    path = tmp_path / "soft.toml"  # a motor of 2e-30 kg m2 beside its link ended in the solver
+    path.write_text(
+        shipped_config("realistic").read_text().replace("motor_inertia_kgm2 = 0.95", "motor_inertia_kgm2 = 1e-18")
+    )
+    with pytest.raises(MarginError):
         require_margin(load_config(path))
 
 
@@ -69,7 +75,7 @@ def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
         ("rate_Hz = .*", 'rate_Hz = "1000"', "loop.rate_Hz (=1000) must be a number"),
         ("rate_Hz = .*", "rate_Hz = true", "loop.rate_Hz (=True) must be a number"),
         ("inertia_kgm2 = .*", "inertia_kgm2 = 0.0", "joint.inertia_kgm2 (=0) must be in (0..10000]"),
-        ("inertia_kgm2 = .*", "inertia_kgm2 = 1e-31", "joint.inertia_kgm2 (=1e-31) must not be nearer to 0 than 1e-30"),
+        ("inertia_kgm2 = .*", "inertia_kgm2 = 1e-19", "joint.inertia_kgm2 (=1e-19) must not be nearer to 0 than 1e-18"),
         ("node = .*", "node = 128", "drive.node (=128) must be in [1..127]"),
         ("node = .*", "node = 1.0", "drive.node (=1) must be a whole number"),
         ("node = .*", "", "drive.node is missing"),
