@@ -149,8 +149,8 @@ class _Draft:
             "# the effort: put those of your joint in their place, then the interface of your bus.\n"
         )
         text = head + re.sub(r"\A#.*\n", "", text)
-        swing_rad, frequency_Hz, _ = self.swing(i)
-        natural_radps, observer_radps = self.gains[i] if self.gains else _GAINS[-1]
+        swing_rad, frequency_Hz, middle_rad = self.swing(i)
+        gains = _gain_keys(self.gains[i] if self.gains else _GAINS[-1])
         values: dict[Place, object] = {
             ("drive", "node"): i + 1,
             ("limits", "position_min_rad"): low,
@@ -159,14 +159,12 @@ class _Draft:
             ("limits", "torque_max_Nm"): joint.effort_max_Nm,
             ("joint", "inertia_kgm2"): self.inertias_kgm2[i] if self.inertias_kgm2 else 1.0,
             ("loop", "rate_Hz"): self.rate_Hz,
-            ("control", "kp"): natural_radps**2,
-            ("control", "kv"): 2.0 * natural_radps,
-            ("control", "observer_radps"): observer_radps,
+            **{("control", key): value for key, value in gains.items()},
             ("control", "feed_forward_lead_s"): "auto",
             ("control", "velocity_cutoff_Hz"): 0.2 * self.rate_Hz,
             ("trajectory", "amplitude_rad"): swing_rad,
             ("trajectory", "frequency_Hz"): frequency_Hz,
-            ("virtual", "initial_position_rad"): self.swing(i)[2],
+            ("virtual", "initial_position_rad"): middle_rad,
             **self.answers[i].values,
         }
         text = filled(text, values)
@@ -253,12 +251,14 @@ def _rate(budgets: Sequence[BusBudget]) -> float:
     return fits
 
 
-def _with(config: Config, gains: tuple[float, float]) -> Config:
+def _gain_keys(gains: tuple[float, float]) -> dict[str, float]:
+    """One of `_GAINS` as keys of [control]."""
     natural_radps, observer_radps = gains
-    control = config.control.model_copy(
-        update={"kp": natural_radps**2, "kv": 2.0 * natural_radps, "observer_radps": observer_radps}
-    )
-    return config.model_copy(update={"control": control})
+    return {"kp": natural_radps**2, "kv": 2.0 * natural_radps, "observer_radps": observer_radps}
+
+
+def _with(config: Config, gains: tuple[float, float]) -> Config:
+    return config.model_copy(update={"control": config.control.model_copy(update=_gain_keys(gains))})
 
 
 def _bears(loop: JointOfArm) -> bool:

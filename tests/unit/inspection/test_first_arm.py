@@ -162,12 +162,18 @@ def test_it_overwrites_nothing_and_its_options_go_together(tmp_path: Path) -> No
         new(tmp_path / "x", out, arm=True, urdf=SHIPPED_ARM, no_input=True)
 
 
-def test_questions_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    urdf = tmp_path / "own.urdf"
+def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, answers: str) -> Path:
+    """The URDF that is asked about at a terminal that gives these lines."""
+    urdf = folder / "own.urdf"
     urdf.write_text(GOOD)
-    stdin = io.StringIO("7\n\n-3\nmany\n9\n0.5\n")
+    stdin = io.StringIO(answers)
     stdin.isatty = lambda: True  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stdin", stdin)
+    return urdf
+
+
+def test_questions_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    urdf = answered(tmp_path, monkeypatch, "7\n\n-3\nmany\n9\n0.5\n")
     out, _, err = output()
     assert new(tmp_path / "arm", out, arm=True, urdf=urdf) == 0
     arm = load_arm(tmp_path / "arm" / "arm.toml")
@@ -182,11 +188,7 @@ def test_questions_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_two_joints_with_one_node_are_refused_with_the_names_of_the_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    urdf = tmp_path / "own.urdf"
-    urdf.write_text(GOOD)
-    stdin = io.StringIO("7\n\n7\n\n")
-    stdin.isatty = lambda: True  # type: ignore[method-assign]
-    monkeypatch.setattr(sys, "stdin", stdin)
+    urdf = answered(tmp_path, monkeypatch, "7\n\n7\n\n")
     out, _, _ = output()
     with pytest.raises(ConfigurationError, match=r"arm/arm\.toml: j2\.toml: drive\.node \(=7\) must differ"):
         new(tmp_path / "arm", out, arm=True, urdf=urdf)
