@@ -31,7 +31,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Self
 
@@ -39,6 +39,7 @@ from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import program_name
+from jointctl.drivers.stop_note import remove_older, stopped, write_note
 
 # --- Unix sockets between programs of one computer: a name, the process at the other end, lines of JSON ---
 
@@ -86,7 +87,6 @@ def parsed_line(data: bytes) -> dict[str, Any] | None:
 # --- The lock ---
 
 
-STARTING = "jointctl-starting"  # marks a program that is about to control a bus, until it has its lock
 NAMES = 8  # of one lock: as many programs would have to hold the others
 _RELEASE_S = 0.05  # a process that was just started holds a copy until it has become another program
 _IN_PROCESS = "virtual"  # python-can's bus of this name ends with the process: no one else can be on it
@@ -99,7 +99,7 @@ class BusLock:
     """Held until `close`; `BusError` names the program that has it.  No lock where the system has no such sockets.
 
     `on_stop` is called in a thread of the lock when the user asks for a stop, once.  `remarks`: what was found and
-    does not keep this program off the bus.
+    does not keep this program off the bus.  `stopped`: whether the user has asked already, before it was held.
     """
 
     def __init__(
@@ -108,12 +108,13 @@ class BusLock:
     ) -> None:  # fmt: skip
         self.marker_fd: int | None = None  # to be handed to every process that acts for this program
         self.remarks: list[str] = []
+        self.stopped = False
         self._place = f"{interface}:{channel}"
         self._on_stop, self._within_s = on_stop, within_s
         self._server: socket.socket | None = None
         self._number = -1  # of the name that this lock has
         self._thread: threading.Thread | None = None
-        if sys.platform != "linux" or interface == _IN_PROCESS:
+        if not _has_lock(interface):
             return
         self._name = lock_name(interface, channel)
         try:
@@ -126,6 +127,7 @@ class BusLock:
         try:
             self._refuse_others()
             self.marker_fd = os.memfd_create(self._name)
+            self.stopped = stopped(self._name)
         except BaseException:
             self.close()
             raise
@@ -337,7 +339,11 @@ def _holders(name: str, but: int = -1) -> list[Holder]:
 
 def lock_holders(interface: str, channel: str) -> list[Holder]:
     """The programs that hold a name of this bus's lock; to be closed."""
-    return _holders(lock_name(interface, channel)) if sys.platform == "linux" and interface != _IN_PROCESS else []
+    return _holders(lock_name(interface, channel)) if _has_lock(interface) else []
+
+
+def _has_lock(interface: str) -> bool:
+    return sys.platform == "linux" and interface != _IN_PROCESS
 
 
 def wait_for_answers(holders: Iterable[Holder], timeout_s: float = ANSWER_S) -> None:
@@ -370,32 +376,6 @@ def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
                 if os.readlink(link).startswith(f"/memfd:{name} "):
                     return True
     return False
-
-
-def mark_starting() -> None:
-    """As `STARTING`, until it has the lock of a bus."""
-    if hasattr(os, "memfd_create"):
-        with contextlib.suppress(OSError):  # as in `no_longer_starting`
-            os.memfd_create(STARTING)
-
-
-@contextlib.contextmanager
-def starting() -> Iterator[None]:
-    """Marked so, until it has the lock of a bus or the block ends."""
-    mark_starting()
-    try:
-        yield
-    finally:
-        no_longer_starting()
-
-
-def no_longer_starting() -> None:
-    """Take the mark away that the program gave itself when it was started (`STARTING`)."""
-    with contextlib.suppress(OSError):  # a system without /proc
-        for link in Path("/proc/self/fd").iterdir():
-            with contextlib.suppress(OSError):
-                if os.readlink(link).startswith(f"/memfd:{STARTING} "):
-                    os.close(int(link.name))
 
 
 def lock_name(interface: str, channel: str) -> str:
@@ -432,8 +412,6 @@ def _program(pid: int) -> str:
 
 
 LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
-STARTING_S = 60.0  # how long a program that was just started may take until it controls its bus: it may compile first
-NOTED_S = 2.0  # after so long the user hears what is waited for
 TERM_S = 1.0  # between SIGTERM and SIGKILL
 KILL_S = 2.0
 POLL_S = 0.02
@@ -444,10 +422,19 @@ ARMED = (
 
 
 class StopCall:
-    """Asks the program that controls the bus to stop, at once; then `end` it.  To be used in a `with` block."""
+    """Asks the program that controls the bus to stop, at once; then `end` it.  To be used in a `with` block.
+
+    A program that was started before, and takes the lock of the bus later, finds the note of this stop and ends.
+    """
 
     def __init__(self, interface: str, channel: str) -> None:
         self._place, self._name = (interface, channel), lock_name(interface, channel)
+        self._unnoted: OSError | None = None
+        try:
+            if _has_lock(interface):
+                write_note(self._name)
+        except OSError as error:
+            self._unnoted = error
         self._ask()
 
     def _ask(self) -> None:
@@ -465,43 +452,22 @@ class StopCall:
     def end(self, note: Callable[[str], None], ended: Callable[[], None] = lambda: None) -> None:
         """The processes of a controller have ended when this returns, or `note` got why not.
 
-        A program that was started before this call, and does not control the bus yet, is waited for and then ended.
         `ended` is called each time a controller has: it may have enabled the drive before.
         """
-        starting = marked_processes(STARTING)
+        if self._unnoted is not None:
+            note(
+                f"the stop cannot be noted for a program that is just starting ({self._unnoted}): "
+                "look whether there is one, and stop again when it runs"
+            )
+        else:
+            remove_older(self._name)
         self._end_controllers(note, ended)
-        for _ in self._each_that_starts(starting, note):
-            self._ask_again()
-            self._end_controllers(note, ended)
-        self._ask_again()
+        self._ask_again()  # one may have taken the lock after the first request
         self._end_controllers(note, ended)
 
     def _ask_again(self) -> None:
         self.__exit__()
         self._ask()
-
-    @staticmethod
-    def _each_that_starts(pids: list[int], note: Callable[[str], None]) -> Iterator[None]:
-        """At once when one of them has its lock or has ended; which bus it is for shows only then.
-
-        They may be another joint's, and take long: this joint's controller must not move while they are waited for.
-        """
-        began_s, noted = time.monotonic(), False
-        while pids:
-            left = [pid for pid in pids if is_marked(pid, STARTING)]
-            if len(left) < len(pids):
-                pids = left
-                yield
-                continue
-            which = f"process {', '.join(map(str, pids))}, which is starting and may be about to control the bus"
-            waited_s = time.monotonic() - began_s
-            if waited_s >= STARTING_S:
-                note(f"not waiting any longer for {which}: end it, or stop again when it runs")
-                return
-            if waited_s > NOTED_S and not noted:
-                note(f"waiting for {which}")
-                noted = True
-            time.sleep(POLL_S)
 
     def _end_controllers(self, note: Callable[[str], None], ended: Callable[[], None]) -> None:
         wait_for_answers(self._holders)

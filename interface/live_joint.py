@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.bus_lock import no_longer_starting, starting
 from jointctl.drivers.errors import JointctlError, MotionFault
+from jointctl.drivers.stop_note import asked
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.joint_source import Source
@@ -35,7 +35,7 @@ from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.set_points import load_check
 
 WHO = "the program"
-ENDED = "the run has ended"
+ENDED, AGAIN = "the run has ended", "begin a new Joint"
 # what takes its time to load, and is needed while the joint waits for its program
 _NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
 ANSWER_S = 2.0  # of the loop to a new motion
@@ -99,8 +99,9 @@ class LiveMotor:
     """See `Motor`.  The session supervises in a thread; the loop has its own process, as in `jointctl run`."""
 
     def __init__(
-        self, source: Source, options: RemoteOptions = NOBODY_REMOTE, *, allow_low_margin: bool = False
+        self, source: Source, asked_ns: int, options: RemoteOptions = NOBODY_REMOTE, *, allow_low_margin: bool = False
     ) -> None:
+        self._asked_ns = asked_ns  # when the program asked for it
         self._source, self._options, self._allow_low_margin = source, options, allow_low_margin
         self.axes = axes_of(source.config)
         self.drive = session_drive(self.axes.joints[0].drive.kind)
@@ -120,14 +121,10 @@ class LiveMotor:
         self.constants: Any = None
         self.axis: Any = None
         self.tables = np.zeros((0, 0, 5))
-        if source.own_virtual:  # no one else knows that bus
-            no_longer_starting()
 
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
-            if not self._source.own_virtual:  # no one else knows that bus
-                self._stack.enter_context(starting())
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
             if self.axes.arm is not None:
@@ -137,9 +134,12 @@ class LiveMotor:
             output = Output(quiet=True)
             others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
             self._stack.enter_context(self._bus)
+            asked(self._asked_ns)
             control = self._control = self._bus.enter_context(
                 in_program(self.axes.joints[0], output, self.axes.joints[1:])
             )
+            if control.signals.commanded_ns:
+                raise MotionFault(f"stopped by {control.signals.name} before it began; nothing has moved", AGAIN)
             self._approval = _Approval(control.signals.leave_if_asked)
             plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
@@ -189,7 +189,7 @@ class LiveMotor:
                 raise MotionFault(f"{named}{joint.fault.name} ({int(joint.fault)}): {text.happened}", text.advice)
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
-        raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", "begin a new Joint")
+        raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", AGAIN)
 
     def require(self) -> None:
         if self.axis is not None and self.axis["phase"].max() > AxisPhase.TRACKING:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from jointctl.drivers.bus_lock import mark_starting, no_longer_starting
 from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
+from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.motion_records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind, in_words
@@ -123,20 +123,8 @@ class NewMotion(NamedTuple):
 
 
 def motor_of(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted, *, lockstep: bool) -> Motor:
-    """The motor for what `Joint` or `Arm` (`kind`) was given.
-
-    From here on `jointctl stop` knows of this program: what it loads before it controls the bus takes seconds.
-    """
-    if not lockstep:
-        mark_starting()
-    try:
-        return _loaded_motor(config, kind, wanted, lockstep=lockstep)
-    except BaseException:
-        no_longer_starting()
-        raise
-
-
-def _loaded_motor(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted, *, lockstep: bool) -> Motor:
+    """The motor for what `Joint` or `Arm` (`kind`) was given; a `jointctl stop` from here on is one of this joint."""
+    asked_ns = now_ns()  # what is loaded below takes seconds
     source, options = wanted_source(config, kind, wanted)
     if lockstep:
         if options.foxglove is not None or options.ros2 is not None:
@@ -146,7 +134,7 @@ def _loaded_motor(config: Config | ArmConfig | str | Path, kind: str, wanted: Wa
         return LockstepMotor(axes_of(source.config))
     from jointctl.live_joint import LiveMotor
 
-    return LiveMotor(source, options, allow_low_margin=wanted.allow_low_margin)
+    return LiveMotor(source, asked_ns, options, allow_low_margin=wanted.allow_low_margin)
 
 
 class Program:

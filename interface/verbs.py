@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
@@ -73,8 +72,7 @@ def __getattr__(name: str) -> Callable[..., object]:
 def _function(name: str) -> Callable[..., object]:
     from typer.models import ArgumentInfo
 
-    from jointctl.drivers.bus_lock import starting
-    from jointctl.tools.verbs.start import will_control
+    from jointctl.drivers.stop_note import asked, now_ns
     from jointctl.tools.verbs.verb_options import option_call
 
     home = import_module(f"jointctl.tools.verbs.{name}")
@@ -99,9 +97,8 @@ def _function(name: str) -> Callable[..., object]:
         values = {option.name: option.default for option in options.values()}
         values |= {options[key].name: _checked(name, key, value, options[key]) for key, value in given.items()}
         found.clear()
-        words = {name.replace("_", "-"), *(f"--{key}" for key, value in given.items() if value is True)}
-        with starting() if will_control(words) else nullcontext():
-            code = call({"json": False, **values}) or 0
+        asked(now_ns())
+        code = call({"json": False, **values}) or 0
         result = found[-1] if found else None
         if code and code != _ANSWERS.get(name):
             _raise(name, code, result)

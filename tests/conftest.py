@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from jointctl.drivers import stop_note
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.hil.canopen import dictionary, encoder_node
 from jointctl.tools.configuration.canopen import canopen_settings
@@ -71,6 +72,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 raise pytest.UsageError(f"{item.nodeid}: pytest.mark.slow needs its reason")
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
     items.sort(key=lambda item: (item.path not in slow, -in_real_time[item.path]))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def notes_of_stops(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Of this process alone: stops of another one that tests the same bus mean nothing here."""
+    stop_note.FOLDER = tmp_path_factory.mktemp("stops")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock, no_longer_starting
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
@@ -181,7 +181,10 @@ def in_control(config: Config, output: Output, others: Sequence[Config] = ()) ->
 
 @contextmanager
 def in_program(config: Config, output: Output, others: Sequence[Config] = ()) -> Iterator[Control]:
-    """As `in_control`, for a run in another thread than the main one: Python's signals stay the program's own."""
+    """As `in_control`, for a run in another thread than the main one: Python's signals stay the program's own.
+
+    A stop that has come before it is in `Control.signals`.
+    """
     joints, signals = (config, *others), StopSignals(wake=lambda: None)
     with _locked(_places(joints), output, _within_s(joints), signals) as control:
         yield control
@@ -212,12 +215,17 @@ def _locked(
 
     A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.
     """
+    words = ""
     try:
         with ExitStack() as stack:
             locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
-            no_longer_starting()
             for remark in (remark for lock in locks for remark in lock.remarks):
                 output.warning(remark)
+            if any(lock.stopped for lock in locks):
+                words = "; nothing moved"
+                signals.on_stop_command()
+                if signals.raising:
+                    signals.leave_if_asked()
             yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(signals.by_command) from None
+        raise KeyboardInterrupt(f"{signals.by_command}{words}") from None

@@ -17,7 +17,11 @@ def clear_fault(config: JointOnBus, output: ResultOutput) -> int:
     kind = session_drive(config.drive.kind)
     kind.refuse_beside_run(config)
     with in_control(config, output) as control, control.signals.held():
-        drive = kind.open(config, control.signals.leave_if_asked)
+        try:
+            drive = kind.open(config, control.signals.leave_if_asked)
+        except KeyboardInterrupt:
+            output.note(f"interrupted{control.signals.by_command}; nothing was sent to the drive")
+            return INTERRUPTED
         try:
             with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
                 done = drive.clear_fault()

@@ -60,11 +60,9 @@ def scope(
 
 def _scope_of_log(path: Path, output: Output, host: str, port: int) -> int:
     """Serve a run log; the page can zoom, but there is nothing to stop."""
-    from jointctl.drivers.bus_lock import no_longer_starting
     from jointctl.tools.recording.run_log_reader import read_run_log
     from jointctl.tools.scoping.feed import scope_order
 
-    no_longer_starting()  # it never controls a bus, and `jointctl stop` need not wait for it
     read_run_log(path)  # what is wrong with it is to be reported here
     order = scope_order(path.stem, host, port, log=str(path))
     output.address(f"scope: {order.url}  (Ctrl-C ends it)")
@@ -83,6 +81,7 @@ def live_scope(
     Nothing moves before a viewer has confirmed the motion envelope that the page shows.  `unwatched_s`: brake when no
     page has been open for so long; None = go on.
     """
+    from jointctl.drivers.stop_note import asked, now_ns
     from jointctl.tools.scoping.feed import scope_order, scope_server
     from jointctl.tools.session.result import run_title, words
 
@@ -94,6 +93,7 @@ def live_scope(
         try:
             while not runs.one():
                 _wait_for_prepare(feed, runs.last_end)
+                asked(now_ns())
             return runs.code
         except KeyboardInterrupt:
             output.note(f"scope ended{runs.ended_by}; {words(runs.drive_state, interrupted=True)}")

@@ -10,7 +10,6 @@ import signal
 import sys
 from types import FrameType
 
-STARTING = "jointctl-starting"  # as in `drivers.bus_lock`, whose imports take their time
 # verbs that control a bus; the tests compare them with what each verb does
 _CONTROLLING = {"run", "sweep", "excite", "map", "response", "tune", "clear-fault", "scope", "demo"}
 _CONTROLLING_WITH = {("doctor", "--motion"), ("params", "restore")}
@@ -20,16 +19,6 @@ def will_control(words: set[str]) -> bool:
     """Whether a command of these words is about to control a bus."""
     controlling = bool(words & _CONTROLLING) or any(words.issuperset(both) for both in _CONTROLLING_WITH)
     return controlling and "--lockstep" not in words
-
-
-def _mark_as_starting() -> None:
-    """`jointctl stop` waits for a program that was started before it, and ends it when it has the lock of its bus.
-
-    A memory file with that name, which the kernel lists; it is closed when the lock is held, or with the process.
-    """
-    if will_control(set(sys.argv[1:])) and hasattr(os, "memfd_create"):
-        with contextlib.suppress(OSError):  # a system without it has no lock either
-            os.memfd_create(STARTING)
 
 
 FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
@@ -107,7 +96,6 @@ def main() -> None:
     ours = _stop_signals()
     for number in ours:
         signal.signal(number, _end_at_once)
-    _mark_as_starting()
     _require_descriptors()
     from jointctl.tools.verbs.main import main as run
 

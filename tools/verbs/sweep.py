@@ -320,9 +320,9 @@ def sweep(
         require_terminal()
     with contextlib.ExitStack() as stack:
         command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output)))
+        if not options.lockstep:
+            command.control = stack.enter_context(in_control(command.config, output))
         try:
-            if not options.lockstep:
-                command.control = stack.enter_context(in_control(command.config, output))
             return command.run()
         except KeyboardInterrupt:
             by = command.control.signals.by_command if command.control is not None else ""

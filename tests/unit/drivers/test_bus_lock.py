@@ -21,7 +21,6 @@ import pytest
 from jointctl.drivers import bus_lock
 from jointctl.drivers.bus_lock import (
     NAMES,
-    STARTING,
     STOP_WITHIN_S,
     BusLock,
     Holder,
@@ -231,29 +230,6 @@ def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, name: str, 
         assert holder.within_s is not None
         assert stopped == [1]
         holder.close()
-
-
-def test_a_program_that_starts_for_too_long_is_named(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_lock, "STARTING_S", 0.6)
-    monkeypatch.setattr(bus_lock, "NOTED_S", 0.2)
-    slow = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(60.0)\n"
-    notes: list[str] = []
-    with controller(channel, slow) as process, StopCall("socketcan", channel) as call:
-        call.end(notes.append, lambda: pytest.fail("no controller was there"))
-        assert process.poll() is None  # it may be another joint's
-    named = [note for note in notes if str(process.pid) in note]
-    assert [note.split(" for ")[0] for note in named] == ["waiting", "not waiting any longer"]
-
-
-def test_a_program_that_starts_is_waited_for(channel: str) -> None:
-    late = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(0.7)\n"
-    notes: list[str] = []
-    ended: list[bool] = []
-    with controller(channel, late + HOLD.replace('print("mine", flush=True)', "")) as process:
-        with StopCall("socketcan", channel) as call:
-            call.end(notes.append, lambda: ended.append(True))
-        assert ended
-        assert process.wait(5.0) == 0
 
 
 # --- the protocol and the marks, one by one ---
@@ -469,16 +445,11 @@ def test_a_process_that_was_just_started_gets_a_moment_to_let_the_lock_go(
     assert len(pauses_s) == bool(still[0])
 
 
-def test_the_marks_follow_the_lock(channel: str) -> None:
-    starting_fd = os.memfd_create(STARTING)
+def test_the_mark_follows_the_lock(channel: str) -> None:
     lock = BusLock("socketcan", channel)
     marker_fd = lock.marker_fd
     assert marker_fd is not None
     assert os.readlink(f"/proc/self/fd/{marker_fd}") == f"/memfd:{lock_name('socketcan', channel)} (deleted)"
-    assert STARTING in os.readlink(f"/proc/self/fd/{starting_fd}")  # it may want the lock of a second bus
-    bus_lock.no_longer_starting()
-    with suppress(OSError):  # its number may have another use by now
-        assert STARTING not in os.readlink(f"/proc/self/fd/{starting_fd}")
     lock.close()
     assert lock.marker_fd is None
 

@@ -6,7 +6,6 @@ import asyncio
 import io
 import json
 import math
-import os
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +17,6 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from jointctl.drivers.bus_lock import STARTING, is_marked
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED, DataError, MotionFault, UsageError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
@@ -698,15 +696,3 @@ def test_the_end_of_a_run_is_told_until_the_next_is_prepared(monkeypatch: pytest
     feed.settings(ended)
     scope_module._wait_for_prepare(feed, ended)
     assert feed.told == [ended] * 3
-
-
-# --- `jointctl scope LOG` controls no joint ---
-@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="no memory files here")
-def test_a_stop_does_not_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    os.memfd_create(STARTING)
-    assert is_marked(os.getpid(), STARTING)
-    monkeypatch.setattr("jointctl.tools.recording.run_log_reader.read_run_log", lambda _: None)
-    monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
-    monkeypatch.setattr(server_module, "serve", lambda _: None)
-    assert scope_module.scope(tmp_path / "run.mcap", Output(quiet=True)) == 0
-    assert not is_marked(os.getpid(), STARTING)

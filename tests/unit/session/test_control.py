@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -126,14 +125,6 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
             signal.raise_signal(signal.SIGTERM)
     assert times_s == [stop_within_s(virtual_config) if configured else 3.0]
     assert "a remark" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("interface", ["socketcan", "virtual"])  # python-can's own has no lock
-def test_with_its_lock_it_no_longer_counts_as_starting(interface: str) -> None:
-    """`jointctl stop` waits for what is starting; what has its lock is reached by it."""
-    starting_fd = os.memfd_create(bus_lock.STARTING)
-    with control_of(interface, f"starting-{os.getpid()}", Output(), 3.0), suppress(OSError):  # the number may be reused
-        assert bus_lock.STARTING not in os.readlink(f"/proc/self/fd/{starting_fd}")
 
 
 @pytest.mark.parametrize(("commanded_ns", "text"), [(1, " by jointctl stop"), (0, "")])
@@ -254,15 +245,15 @@ class Program:
 
 
 class Computer:
-    """`holders`: who has the lock at each further look.  `starting`, `marked`: process -> when it loses its mark."""
+    """`holders`: who has the lock at each further look.  `marked`: process -> when it loses its mark."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, *holders: list[Program], marked: dict[int, float] | None = None,
-        starting: dict[int, float] | None = None, deaf_to: tuple[signal.Signals, ...] = (),
+        deaf_to: tuple[signal.Signals, ...] = (),
     ) -> None:  # fmt: skip
         self.now_s = 0.0
         self.holders = [*holders]
-        self.marks = {bus_lock.STARTING: starting or {}, lock_name("socketcan", "x"): marked or {}}
+        self.marks = {lock_name("socketcan", "x"): marked or {}}
         self.deaf_to = deaf_to
         self.signals: list[tuple[list[int], str, float]] = []
         self.notes: list[str] = []
@@ -361,29 +352,6 @@ def test_a_controller_that_was_asked_is_not_asked_again(monkeypatch: pytest.Monk
     computer = Computer(monkeypatch, [Program(within_s=8.0, leaves_s=0.1)], marked={7: 0.1})
     computer.stopped()
     assert computer.notes == ["stopping the program that controls the bus (pid 7)"]
-
-
-@pytest.mark.parametrize(("started_s", "waited_s"), [(0.0, 0.0), (3.0, 3.0), (FOR_EVER, bus_lock.STARTING_S)])
-def test_one_that_starts_is_waited_for_and_ended_as_well(
-    monkeypatch: pytest.MonkeyPatch, started_s: float, waited_s: float
-) -> None:
-    later = Program(leaves_s=0.0, within_s=8.0)
-    computer = Computer(monkeypatch, [], [later], starting={7: started_s, 8: 0.0})
-    assert computer.stopped()
-    assert computer.now_s == waited_s
-    assert later.log == ["stop", "closed"]
-
-
-@pytest.mark.parametrize("other_s", [1.0, 30.0])
-def test_one_that_starts_does_not_move_while_another_one_is_waited_for(
-    monkeypatch: pytest.MonkeyPatch, other_s: float
-) -> None:
-    """The other one may be another joint's, and compile for a minute."""
-    later = Program(leaves_s=1.5, within_s=8.0)
-    computer = Computer(monkeypatch, [], [later], starting={7: 1.0, 8: other_s})
-    assert computer.stopped()
-    assert computer.ended_s == [pytest.approx(1.5, abs=0.03)]
-    assert computer.now_s >= other_s
 
 
 @pytest.mark.parametrize("deaf_to", [(), (signal.SIGTERM,), (signal.SIGTERM, signal.SIGKILL)])
