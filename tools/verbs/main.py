@@ -6,6 +6,7 @@ import atexit
 import errno
 import gc
 import os
+import signal
 import sys
 from typing import Annotated, Any, NoReturn
 
@@ -118,7 +119,11 @@ def _end_unexpected(error: Exception) -> NoReturn:
     """What a verb did not foresee: one line on stderr and code 1; with `TRACEBACK` set it is raised again.
 
     By then the verb has been left: a drive that it had under power has been switched off on the way.
+
+    After a stop it is that stop: a library makes something else of a KeyboardInterrupt, pydantic where it calls Python.
     """
+    if any(getattr(signal.getsignal(number), "seen", False) for number in (signal.SIGINT, signal.SIGTERM)):
+        raise KeyboardInterrupt from error
     if os.environ.get(TRACEBACK):
         raise error
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):

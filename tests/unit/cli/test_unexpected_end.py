@@ -20,7 +20,7 @@ from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.verbs import doctor, run, sweep, verb_options
+from jointctl.tools.verbs import doctor, run, start, sweep, verb_options
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
@@ -95,6 +95,13 @@ def test_an_unexpected_error_is_one_line(
     assert words in told[0]
     monkeypatch.setenv(TRACEBACK, "1")
     with pytest.raises(type(error)):
+        main_module.main()
+    stopped = start.Interruption()
+    monkeypatch.setattr(signal, "getsignal", lambda _: stopped)
+    with pytest.raises(type(error)):
+        main_module.main()
+    stopped.seen = True  # a library has made this error of the KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
         main_module.main()
 
 
