@@ -275,7 +275,8 @@ class Sweep:
             shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in list(self._unsettled.values())[:8])
             self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown} rad/s")
         if stopped:
-            self.output.note(f"stopped by {stopped}; what was measured is in {self.out}, --resume goes on")
+            kept = f"what was measured is in {self.out}, --resume goes on" if done else "nothing was measured"
+            self.output.note(f"stopped by {stopped}; {kept}")
             return INTERRUPTED
         return 0
 
