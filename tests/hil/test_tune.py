@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -154,6 +155,29 @@ def test_a_filter_that_reads_a_count_as_motion_raises_what_counts_as_standing(tm
     coarse = changed(config, encoder__counts_per_turn=2**14)
     limits = Tune(coarse, TuneOptions(lockstep=True), carrier, tmp_path)._limits_with(quick)
     assert limits.standstill_radps == pytest.approx(0.1 * config.limits.velocity_max_radps)
+
+
+@pytest.mark.parametrize("plan", ["same", "another"])
+def test_a_friction_step_that_was_cut_off_goes_on_where_it_ended(tmp_path: Path, plan: str) -> None:
+    config = load_config(written(tmp_path / "joint.toml", "precise"))
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+
+    def step(*, resume: bool) -> dict[str, Any]:
+        job = Tune(config, TuneOptions(lockstep=True, resume=resume), carrier, tmp_path)
+        job.state = {"direction": [{"numbers": {"break_away_Nm": 19.0}}], "response": {"gravity": {}}}
+        return job._step_friction()
+
+    step(resume=False)
+    path, beside = tmp_path / "friction.csv", tmp_path / "friction.json"
+    kept, sidecar = path.read_bytes().splitlines(keepends=True)[:11], json.loads(beside.read_text())
+    every = set(sidecar["measured"])
+    kept[2] = b",".join([*(fields := kept[2].split(b","))[:9], b"0.001", *fields[10:]])  # at a time as no other one
+    path.write_bytes(b"".join(kept))
+    sidecar |= {"measured": sidecar["measured"][:10], "unsettled": {}} | ({"plan": "0"} if plan == "another" else {})
+    beside.write_text(json.dumps(sidecar))
+    assert step(resume=True)["points"] > 30
+    assert set(json.loads(beside.read_text())["measured"]) == every
+    assert (path.read_bytes().splitlines(keepends=True)[:11] == kept) is (plan == "same")
 
 
 def test_what_cannot_be_is_refused_before_anything_moves(tmp_path: Path) -> None:

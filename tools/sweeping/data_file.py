@@ -178,6 +178,15 @@ class SweepFile:
             self._settle(self._last)
 
 
+def measured_before(path: Path, plan: str) -> bool:
+    """Whether these files are an interrupted sweep of this plan."""
+    try:
+        SweepFile.resume(path, 1.0, plan).close()
+    except DataError:
+        return False
+    return path.exists()
+
+
 # --- The page of a sweep: what was measured, drawn and listed, from the files that the sweep has written ---
 
 

@@ -34,6 +34,7 @@ from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
 from jointctl.tools.session.plan import ConfiguredMotion
+from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import (
@@ -312,8 +313,6 @@ class Tune:
 
     def _step_friction(self) -> dict[str, Any]:
         path = self.folder / "friction.csv"
-        for old in (path, path.with_suffix(".json")):
-            old.unlink(missing_ok=True)
         options = SweepOptions(
             points=SWEEP_POINTS, dwell_s=SWEEP_DWELL_s, warm_up_turns=WARM_UP_TURNS,
             mode="torque", assume_yes=True, lockstep=self.options.lockstep, grid="log",
@@ -322,6 +321,11 @@ class Tune:
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
         options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
         command = Sweep(self._sliding(), self.carrier.quietly(), path, options)
+        if self.options.resume and measured_before(path, command.plan.hash):
+            command.options = replace(options, resume=True)
+        else:
+            for old in (path, path.with_suffix(".json")):
+                old.unlink(missing_ok=True)
         command.control = control = self.carrier.control
         try:
             ended = command.run()
