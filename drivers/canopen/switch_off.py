@@ -100,14 +100,13 @@ class SwitchOff:
         """The quick stop, ours or its controller's, in the NMT state that the node has; not longer than it is obeyed.
 
         That the drive is off goes to the controller with the node's next TPDOs, of which there are none once it has
-        left operational: without them the controller's loop would wait for its time-outs.
+        left operational: without them the controller's loop would wait for its time-outs.  A drive that was off already
+        gets no such time: a loop that is about to enable it would.
         """
         state = state_of(self._objects)
         if state is State.OPERATION_ENABLED:
             self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
-        if state in POWERED_STATES:
-            state = self._braked()
-        if state in OFF_STATES:
+        if state in POWERED_STATES and self._braked() in OFF_STATES:
             self._sleep(POLL_S)
 
     def _braked(self) -> State:

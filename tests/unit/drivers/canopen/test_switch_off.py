@@ -203,7 +203,7 @@ def test_out_of_operational_before_the_controlword_is_ours(
         ([ON, BRAKING, SWITCHED, OFF], [QUICK_STOP, POLL_S]),  # its controller does not leave it alone
         ([BRAKING, BRAKING, OFF], [POLL_S, POLL_S]),  # its controller has asked for it, and sees how it ends
         ([BRAKING, ON, OFF], []),  # enabled again: not obeyed
-        ([OFF], [POLL_S]),
+        ([OFF], []),  # the loop of its controller may be about to enable it
         ([SWITCHED, OFF], []),
         ([SILENCE, OFF], []),
         ([DEAD_BUS, OFF], []),
