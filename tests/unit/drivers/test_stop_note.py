@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -151,12 +152,31 @@ def test_a_stop_of_its_own_ends_nothing_but_what_it_has_begun_before(
     assert stopped(LOCK)
 
 
-def test_its_own_process_is_dated_by_the_clock_of_the_notes() -> None:
+def test_a_process_is_dated_by_the_clock_of_the_notes() -> None:
     before_ns = now_ns()
-    date = "from jointctl.drivers.stop_note import _started_ns, now_ns; print(_started_ns(), now_ns())"
-    told = subprocess.run([sys.executable, "-c", date], capture_output=True, text=True, check=True).stdout.split()
+    reading, writing = os.pipe()
+    if (pid := os.fork()) == 0:
+        os.write(writing, f"{stop_note._started_ns()} {now_ns()}".encode())
+        os._exit(0)
+    os.waitpid(pid, 0)
+    with open(reading) as told:
+        os.close(writing)
+        started_ns, later_ns = map(int, told.read().split())
     tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
-    assert before_ns - tick_ns <= int(told[0]) < int(told[1]) < now_ns()
+    assert before_ns - tick_ns <= started_ns < later_ns < now_ns()
+
+
+def test_without_such_files_there_is_nothing_to_compare(monkeypatch: pytest.MonkeyPatch) -> None:
+    write_note(LOCK)
+    monkeypatch.setattr(stop_note, "_status", lambda _: [])
+    assert not stopped(LOCK)
+
+
+def test_a_stop_comes_from_its_process_and_those_above_but_not_from_everyones() -> None:
+    from_here = list(stop_note._ancestors(os.getpid()))
+    assert from_here[:2] == [os.getpid(), os.getppid()]
+    assert 1 not in from_here
+    assert list(stop_note._ancestors(2**22 + 1)) == [2**22 + 1]  # the kernel has no such process
 
 
 @pytest.mark.parametrize("content", [b"", b"x", b"12 y", b"\0" * 8, b"-", "\u0663".encode(), b"9" * 5000])
@@ -169,24 +189,24 @@ def test_garbage_is_no_note(notes: Path, content: bytes) -> None:
 
 
 @pytest.mark.usefixtures("others")
-@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's"])
-def test_what_is_not_ours_is_no_note(notes: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's", "root's"])
+def test_what_is_neither_ours_nor_roots_is_no_note(notes: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     write_note(LOCK)
     (path,) = notes.iterdir()
     assert stopped(LOCK)
-    if kind == "another's":
-        monkeypatch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
-        expected = path.stat().st_uid == 0  # root's counts for everyone
+    if kind in ("another's", "root's"):
+        owner, mode = {"another's": 4711, "root's": 0}[kind], path.stat().st_mode
+        others = {"geteuid": lambda: 4712, "fstat": lambda _: SimpleNamespace(st_mode=mode, st_uid=owner)}
+        monkeypatch.setattr(stop_note, "os", SimpleNamespace(**{**vars(os), **others}))
     else:
-        expected = False
         content = path.rename(notes / "elsewhere")
         {"link": lambda: path.symlink_to(content), "fifo": lambda: os.mkfifo(path), "folder": path.mkdir}[kind]()
-    assert stopped(LOCK) is expected
+    assert stopped(LOCK) is (kind == "root's")
 
 
 @pytest.mark.usefixtures("others")
 def test_the_newest_of_each_lock_stays_for_a_day(notes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = now_ns()
+    now, umask = now_ns(), os.umask(0o077)
     monkeypatch.setattr(stop_note, "now_ns", lambda: now)
     write_note("jointctl-bus-old")
     now += round(KEPT_S * 1e9)
@@ -194,6 +214,7 @@ def test_the_newest_of_each_lock_stays_for_a_day(notes: Path, monkeypatch: pytes
     for _ in range(3):
         write_note(LOCK)
         now += 1
+    os.umask(umask)
     remove_older(LOCK)
     left = sorted(path.name.rpartition("-stop-")[0] for path in notes.iterdir())
     assert left == ["jointctl-bus-new", LOCK]
