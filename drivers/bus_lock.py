@@ -39,7 +39,7 @@ from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import program_name
-from jointctl.drivers.stop_note import remove_older, stopped, write_note
+from jointctl.drivers.stop_note import remove_old, settle, stopped, write_note
 
 # --- Unix sockets between programs of one computer: a name, the process at the other end, lines of JSON ---
 
@@ -254,6 +254,7 @@ class BusLock:
                     answer["refused"] = "this program belongs to another user"
                 else:
                     answer["within_s"] = self._within_s
+                    settle(self._name)
                     if self._on_stop is not None:
                         self._on_stop()
                         self._on_stop = None
@@ -430,12 +431,15 @@ class StopCall:
     def __init__(self, interface: str, channel: str) -> None:
         self._place, self._name = (interface, channel), lock_name(interface, channel)
         self._unnoted: OSError | None = None
+        self._note()
+        self._ask()
+
+    def _note(self) -> None:
         try:
-            if _has_lock(interface):
+            if _has_lock(self._place[0]):
                 write_note(self._name)
         except OSError as error:
             self._unnoted = error
-        self._ask()
 
     def _ask(self) -> None:
         self._holders = lock_holders(*self._place)
@@ -454,16 +458,17 @@ class StopCall:
 
         `ended` is called each time a controller has: it may have enabled the drive before.
         """
+        self._end_controllers(note, ended)
+        self._note()  # for those that were started in the meantime
+        self._ask_again()
+        self._end_controllers(note, ended)
         if self._unnoted is not None:
             note(
                 f"the stop cannot be noted for a program that is just starting ({self._unnoted}): "
                 "look whether there is one, and stop again when it runs"
             )
-        else:
-            remove_older(self._name)
-        self._end_controllers(note, ended)
-        self._ask_again()  # one may have taken the lock after the first request
-        self._end_controllers(note, ended)
+        elif _has_lock(self._place[0]):
+            remove_old(self._name)
 
     def _ask_again(self) -> None:
         self.__exit__()

@@ -1,10 +1,11 @@
-"""What `jointctl stop` leaves for a program that was started before it and takes the lock of its bus later.
+"""What `jointctl stop` leaves for a program that takes the lock of its bus later.
 
 `stop` writes its note, and then asks the program that holds the lock; a program takes the lock, and then reads the
 notes.  Whatever their order, one of the two sees the other: no one has to know who is about to start, nor to wait.
 
-A note is a file in the memory of this computer: the time by the clock that no standby stops, and the processes that
-the stop came from.  It stays until the next stop of that bus, or for a day.  Those of this user and of root count.
+A note counts once, for each program that runs when it is written: for the next bus of that name that it takes.  It is a
+file in the memory of this computer: the time by the clock that no standby stops, and the processes that the stop came
+from.  Those of this user and of root count, for a day.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,19 +21,18 @@ from typing import NamedTuple
 
 FOLDER = Path("/dev/shm")
 KEPT_S = 86_400.0  # no program takes so long from its start to its bus
-STARTING_S = 60.0  # a Python program that has not asked for its joint for so long was not started for it
+MOST = 64  # that are kept of a lock
 _LONGEST = 4096  # bytes of a note
 
 
 class _Note(NamedTuple):
     time_ns: int
-    by: frozenset[int]  # the process of that stop, and those that it descends from
+    by: frozenset[str]  # the process of that stop, and those that it descends from, as `_process`
 
 
-_asked_ns: int | None = (
-    None  # when this process was asked for what it does; None = when it was started, as each verb is
-)
-_served: set[str] = set()  # locks that it has had, or has given up for a note
+_settled_ns: dict[str, int] = {}  # for each lock: up to then this process knows of the stops
+_anew_ns = 0  # when a user has asked this process for what it does next: what was before is over
+_asked_ns: int | None = None  # when a program of the user's has asked for the joint; a verb is asked by its start
 
 
 def now_ns() -> int:
@@ -40,58 +41,67 @@ def now_ns() -> int:
 
 
 def asked(at_ns: int) -> None:
-    """This process was asked by its user at `at_ns`, for the lock that it takes next.
-
-    For what lives on from one request to the next: a Python program, a page.
-    """
+    """The program has asked for the joint at `at_ns`: stops that come from itself count since then only."""
     global _asked_ns
     _asked_ns = at_ns
 
 
+def asked_anew() -> None:
+    """A user, who knows of the stops before, has asked this process now: as by a button of the page."""
+    global _anew_ns
+    _anew_ns = now_ns()
+
+
+def settle(lock: str) -> None:
+    """The stops of this lock until now have reached this process."""
+    _settled_ns[lock] = now_ns()
+
+
 def write_note(lock: str) -> None:
-    """From now on no program that was started or asked before gets on with this lock; `OSError` if it cannot be kept.
+    """From now on no program that runs already gets on with this lock unseen; `OSError` if it cannot be kept.
 
     Loads and looks for nothing: the drive is still to be stopped.
     """
     written_ns = now_ns()
     path = FOLDER / f"{_prefix(lock)}{written_ns}-{os.getpid()}"
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    with open(fd, "wb") as file:
+    try:
         os.fchmod(fd, 0o644)  # whatever the umask: root's counts for everyone
-        file.write(" ".join(map(str, (written_ns, *_ancestors(os.getpid())))).encode())
+        os.write(fd, " ".join((str(written_ns), *map(_process, _ancestors(os.getpid())))).encode())
+    except BaseException:
+        path.unlink()
+        raise
+    finally:
+        os.close(fd)
 
 
-def remove_older(lock: str) -> None:
-    """All notes but the newest of this lock, and of every other lock those that are older than `KEPT_S`."""
-    notes = [(note.time_ns, path) for path in _files(lock) if (note := _read(path)) is not None]
-    long_ago_ns = now_ns() - KEPT_S * 1e9
-    every = ((path, _read(path)) for path in _files("jointctl-bus-*"))
-    outdated = [path for path, note in every if note is not None and note.time_ns < long_ago_ns]
-    for path in [path for _, path in sorted(notes)[:-1]] + outdated:
+def remove_old(lock: str) -> None:
+    """Those that count no longer, of all locks, and of this one what is more than `MOST`."""
+    every = [(note, path) for path in _files("jointctl-bus-*") if (note := _read(path)) is not None]
+    outdated = [path for note, path in every if not _counts(note)]
+    newest_first = sorted(((note.time_ns, path) for note, path in every if path.name.startswith(_prefix(lock))))[::-1]
+    for path in [path for _, path in newest_first[MOST:]] + outdated:
         with contextlib.suppress(OSError):  # another stop was quicker, or it is root's
             path.unlink()
 
 
 def stopped(lock: str) -> bool:
-    """Whether a stop has come since this process was asked; to be called while it holds the lock.
+    """Whether a stop has come that this process does not know of; to be called while it holds the lock.  Settles it.
 
-    A stop that came from this process itself, as by `subprocess.run`, counts only after it was asked for the joint.
+    A stop that came from this process itself, as by `subprocess.run`, counts only after it has asked for the joint.
     """
-    pid, first = os.getpid(), lock not in _served
-    _served.add(lock)
-    try:
-        started_ns = _started_ns()
-    except (OSError, ValueError, IndexError):  # no such files: then there are no locks either
-        return False
+    at_ns, me = now_ns(), _process(os.getpid())
+    settled_ns, began_ns = _settled_ns.get(lock, 0), max(_began_ns(), _anew_ns)
+    found = False
     for note in filter(None, map(_read, _files(lock))):
-        since_ns = started_ns
-        if pid in note.by:
+        if not _counts(note):
+            continue
+        since_ns = began_ns
+        if me in note.by:
             since_ns = _asked_ns if _asked_ns is not None else note.time_ns + 1
-        elif _asked_ns is not None and (not first or note.time_ns > started_ns + STARTING_S * 1e9):
-            since_ns = _asked_ns
-        if note.time_ns >= since_ns:
-            return True
-    return False
+        found = found or (note.time_ns > settled_ns and note.time_ns >= since_ns)
+    _settled_ns[lock] = at_ns
+    return found
 
 
 def _prefix(lock: str) -> str:
@@ -103,16 +113,27 @@ def _files(lock: str) -> Iterator[Path]:
         yield from FOLDER.glob(f"{_prefix(lock)}*")
 
 
+def _counts(note: _Note) -> bool:
+    return 0 <= now_ns() - note.time_ns <= KEPT_S * 1e9
+
+
 def _read(path: Path) -> _Note | None:
     """None where it is no note, not one of ours, or not yet written: its stop has not asked for the lock then."""
     with contextlib.suppress(OSError, ValueError):
         fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(fd, "rb") as file:
+        try:
             about = os.fstat(fd)
-            if stat.S_ISREG(about.st_mode) and about.st_uid in (os.geteuid(), 0):
-                time_ns, *by = map(int, file.read(_LONGEST).split())
-                return _Note(time_ns, frozenset(by)) if time_ns <= now_ns() else None
+            ours = stat.S_ISREG(about.st_mode) and about.st_uid in (os.geteuid(), 0)
+            # a file that others may write to, or have linked to this name, is no one's
+            if ours and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and about.st_nlink == 1:
+                first, *by = os.read(fd, _LONGEST).decode("ascii").split()
+                return _Note(int(first), frozenset(by))
+        finally:
+            os.close(fd)
     return None
+
+
+# --- Processes and their dates ---
 
 
 def _status(pid: int) -> list[str]:
@@ -120,9 +141,31 @@ def _status(pid: int) -> list[str]:
     return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].decode("ascii").split()
 
 
-def _started_ns() -> int:
-    """When this process began, by the same clock; up to one tick of the kernel's early."""
-    return int(_status(os.getpid())[19]) * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+def _process(pid: int) -> str:
+    """With its date: another one may have the same number, later or in a container."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return f"{pid}:{_status(pid)[19]}"
+    return f"{pid}:"
+
+
+def _started_ns(pid: int) -> int:
+    """When a process began, by the clock of the notes; up to one tick of the kernel's early.  0 where no one knows."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return int(_status(pid)[19]) * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+    return 0
+
+
+_first_ns = _started_ns(os.getpid())  # a process that is forked inherits what it acts for, and this date
+
+
+def _began_ns() -> int:
+    """When this program began: with the process that has started this one to share its work, where there is one."""
+    began_ns = min(_first_ns, _started_ns(os.getpid()))
+    if (shared := sys.modules.get("multiprocessing.process")) is not None:
+        parent = shared.parent_process()
+        if parent is not None and (parents_ns := _started_ns(parent.pid)):
+            began_ns = min(began_ns, parents_ns)
+    return began_ns
 
 
 def _ancestors(pid: int) -> Iterator[int]:

@@ -123,7 +123,7 @@ class NewMotion(NamedTuple):
 
 
 def motor_of(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted, *, lockstep: bool) -> Motor:
-    """The motor for what `Joint` or `Arm` (`kind`) was given; a `jointctl stop` from here on is one of this joint."""
+    """The motor for what `Joint` or `Arm` (`kind`) was given; stops of its own count from here on."""
     asked_ns = now_ns()  # what is loaded below takes seconds
     source, options = wanted_source(config, kind, wanted)
     if lockstep:

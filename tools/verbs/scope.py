@@ -81,7 +81,7 @@ def live_scope(
     Nothing moves before a viewer has confirmed the motion envelope that the page shows.  `unwatched_s`: brake when no
     page has been open for so long; None = go on.
     """
-    from jointctl.drivers.stop_note import asked, now_ns
+    from jointctl.drivers.stop_note import asked_anew
     from jointctl.tools.scoping.feed import scope_order, scope_server
     from jointctl.tools.session.result import run_title, words
 
@@ -93,11 +93,12 @@ def live_scope(
         try:
             while not runs.one():
                 _wait_for_prepare(feed, runs.last_end)
-                asked(now_ns())
+                asked_anew()
             return runs.code
-        except KeyboardInterrupt:
-            output.note(f"scope ended{runs.ended_by}; {words(runs.drive_state, interrupted=True)}")
-            return runs.code
+        except KeyboardInterrupt as ended:
+            by = runs.ended_by or str(ended)  # which names a stop that came before the bus was taken
+            output.note(f"scope ended{by}; {words(runs.drive_state, interrupted=True)}")
+            return INTERRUPTED if by else runs.code
 
 
 class _Runs:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +18,7 @@ import pytest
 
 from jointctl.drivers import bus_lock, stop_note
 from jointctl.drivers.bus_lock import BusLock, StopCall, lock_name
-from jointctl.drivers.stop_note import KEPT_S, asked, now_ns, remove_older, stopped, write_note
+from jointctl.drivers.stop_note import KEPT_S, MOST, asked, asked_anew, now_ns, remove_old, settle, stopped, write_note
 
 LOCK = "jointctl-bus-tested"
 EVERYONES = Path("/dev/shm")
@@ -23,25 +28,29 @@ TAKES = (  # the lock, when it is told to; what it found
 )
 
 
+def forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("_asked_ns", None), ("_anew_ns", 0), ("_settled_ns", {})):
+        monkeypatch.setattr(stop_note, name, value)
+
+
 @pytest.fixture(autouse=True)
 def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of its own, for a process that has not been asked for anything yet."""
     monkeypatch.setattr(stop_note, "FOLDER", tmp_path)
-    monkeypatch.setattr(stop_note, "_asked_ns", None)
-    monkeypatch.setattr(stop_note, "_served", set())
+    forget(monkeypatch)
     return tmp_path
 
 
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stops of this process are another's."""
-    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter([1_000_000_001]))
+    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
 
 
-def started(monkeypatch: pytest.MonkeyPatch, ago_s: float) -> int:
-    started_ns = now_ns() - round(ago_s * 1e9)
-    monkeypatch.setattr(stop_note, "_started_ns", lambda: started_ns)
-    return started_ns
+def started(monkeypatch: pytest.MonkeyPatch, ago_s: float) -> None:
+    began_ns = now_ns() - round(ago_s * 1e9)
+    monkeypatch.setattr(stop_note, "_first_ns", began_ns)
+    monkeypatch.setattr(stop_note, "_started_ns", lambda _: began_ns)
 
 
 @pytest.mark.parametrize("before_s", [0.0, 0.3])
@@ -92,40 +101,71 @@ def test_in_whatever_order_they_act_one_sees_the_other(order: str) -> None:
 
 
 @pytest.mark.usefixtures("others")
-def test_a_verb_is_stopped_by_each_stop_since_its_process_began(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_counts_for_who_runs_when_it_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not stopped(LOCK)
     write_note(LOCK)
     started(monkeypatch, -0.001)
+    forget(monkeypatch)
     assert not stopped(LOCK)
     started(monkeypatch, 10_000.0)  # it may have compiled, or waited for another lock
-    assert stopped(LOCK)
-    assert stopped(LOCK)
+    forget(monkeypatch)
     assert not stopped(LOCK + "2")
+    assert stopped(LOCK)
 
 
 @pytest.mark.usefixtures("others")
-def test_a_program_that_was_asked_later_is_its_users_new_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A notebook of this morning, a page: what was stopped before is another matter."""
+def test_it_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that begins one joint after the other: a stop between two of them is one of the next."""
+    started(monkeypatch, 100.0)
+    write_note(LOCK)
+    write_note(LOCK)
+    assert [stopped(LOCK), stopped(LOCK)] == [True, False]
+    write_note(LOCK)
+    asked(now_ns())  # a later stop of its own takes back nothing
+    write_note(LOCK)
+    assert [stopped(LOCK), stopped(LOCK)] == [True, False]
+
+
+@pytest.mark.usefixtures("others")
+def test_one_that_has_reached_the_holder_of_the_lock_is_known_to_it() -> None:
+    write_note(LOCK)
+    settle(LOCK)
+    assert not stopped(LOCK)
+    channel, reached = f"stop-note-holder-{os.getpid()}", threading.Event()
+    with BusLock("socketcan", channel, reached.set) as lock, StopCall("socketcan", channel):
+        assert reached.wait(5.0)
+    with BusLock("socketcan", channel, reached.set) as lock:
+        assert not lock.stopped
+        write_note(lock._name)
+    with BusLock("socketcan", channel) as lock:
+        assert lock.stopped  # it was noted while the lock was held, and never asked for: that came too late
+
+
+@pytest.mark.usefixtures("others")
+def test_what_was_before_a_users_new_request_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the page: "Prepare"."""
     started(monkeypatch, 3600.0)
     write_note(LOCK)
-    asked(now_ns())
+    asked_anew()
     assert not stopped(LOCK)
-    write_note(LOCK)  # while it loads
+    asked_anew()
+    write_note(LOCK)  # while it is prepared
     assert stopped(LOCK)
 
 
 @pytest.mark.usefixtures("others")
-@pytest.mark.parametrize(("ago_s", "found"), [(59.0, True), (61.0, False)])
-def test_one_that_has_just_been_started_was_started_for_its_joint(
-    monkeypatch: pytest.MonkeyPatch, ago_s: float, found: bool
-) -> None:
-    """It imports what it needs before it comes to the line with its `Joint`, for seconds on a busy computer."""
-    started(monkeypatch, ago_s)
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_process_that_does_a_part_of_the_work_began_with_the_program(method: str, notes: Path) -> None:
+    """Its joint is one of the program that has started it, before or after the stop."""
     write_note(LOCK)
-    asked(now_ns())
-    assert stopped(LOCK) is found
-    asked(now_ns())  # once more: it knows of that stop by now
-    assert not stopped(LOCK)
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        assert pool.submit(stopped_in, notes).result()
+
+
+def stopped_in(notes: Path) -> bool:
+    stop_note.FOLDER = notes
+    return stopped(LOCK)
 
 
 @pytest.mark.parametrize("way", ["itself", "child"])
@@ -154,22 +194,18 @@ def test_a_stop_of_its_own_ends_nothing_but_what_it_has_begun_before(
 
 def test_a_process_is_dated_by_the_clock_of_the_notes() -> None:
     before_ns = now_ns()
-    reading, writing = os.pipe()
-    if (pid := os.fork()) == 0:
-        os.write(writing, f"{stop_note._started_ns()} {now_ns()}".encode())
-        os._exit(0)
-    os.waitpid(pid, 0)
-    with open(reading) as told:
-        os.close(writing)
-        started_ns, later_ns = map(int, told.read().split())
+    with subprocess.Popen(["sleep", "60"]) as process:
+        started_ns = stop_note._started_ns(process.pid)
+        process.kill()
     tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
-    assert before_ns - tick_ns <= started_ns < later_ns < now_ns()
+    assert before_ns - tick_ns <= started_ns < now_ns()
 
 
-def test_without_such_files_there_is_nothing_to_compare(monkeypatch: pytest.MonkeyPatch) -> None:
-    write_note(LOCK)
+def test_where_no_one_knows_when_it_began_each_stop_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
     monkeypatch.setattr(stop_note, "_status", lambda _: [])
-    assert not stopped(LOCK)
+    write_note(LOCK)
+    assert stopped(LOCK)
 
 
 def test_a_stop_comes_from_its_process_and_those_above_but_not_from_everyones() -> None:
@@ -179,49 +215,70 @@ def test_a_stop_comes_from_its_process_and_those_above_but_not_from_everyones() 
     assert list(stop_note._ancestors(2**22 + 1)) == [2**22 + 1]  # the kernel has no such process
 
 
-@pytest.mark.parametrize("content", [b"", b"x", b"12 y", b"\0" * 8, b"-", "\u0663".encode(), b"9" * 5000])
+def test_another_process_of_the_same_number_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a container numbers are small, and come again."""
+    date, status = "1", stop_note._status
+    monkeypatch.setattr(stop_note, "_status", lambda pid: [*status(pid)[:19], date, *status(pid)[20:]])
+    write_note(LOCK)
+    date = "2"
+    monkeypatch.setattr(stop_note, "_began_ns", lambda: 0)
+    assert stopped(LOCK)
+
+
+@pytest.mark.parametrize("content", [b"", b"x", b"\0" * 8, b"-", "\u0663".encode(), b"9" * 5000, b"9" * 40])
 def test_garbage_is_no_note(notes: Path, content: bytes) -> None:
-    (notes / f"{LOCK}-stop-1").write_bytes(content)
+    garbage = notes / f"{LOCK}-stop-1"
+    garbage.write_bytes(content)
     assert not stopped(LOCK)
     write_note(LOCK)
-    remove_older(LOCK)
-    assert len(list(notes.iterdir())) == 2
+    remove_old(LOCK)
+    assert [path for path in notes.iterdir() if path != garbage]
 
 
 @pytest.mark.usefixtures("others")
-@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's", "root's"])
+@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's", "root's", "open", "linked"])
 def test_what_is_neither_ours_nor_roots_is_no_note(notes: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     write_note(LOCK)
     (path,) = notes.iterdir()
     assert stopped(LOCK)
     if kind in ("another's", "root's"):
         owner, mode = {"another's": 4711, "root's": 0}[kind], path.stat().st_mode
-        others = {"geteuid": lambda: 4712, "fstat": lambda _: SimpleNamespace(st_mode=mode, st_uid=owner)}
+        others = {"geteuid": lambda: 4712, "fstat": lambda _: SimpleNamespace(st_mode=mode, st_uid=owner, st_nlink=1)}
         monkeypatch.setattr(stop_note, "os", SimpleNamespace(**{**vars(os), **others}))
     else:
         content = path.rename(notes / "elsewhere")
-        {"link": lambda: path.symlink_to(content), "fifo": lambda: os.mkfifo(path), "folder": path.mkdir}[kind]()
+        made: dict[str, Callable[[], object]] = {
+            "link": lambda: path.symlink_to(content), "fifo": lambda: os.mkfifo(path), "folder": path.mkdir,
+            "linked": lambda: path.hardlink_to(content),
+            "open": lambda: (shutil.copy(content, path), path.chmod(0o666)),
+        }  # fmt: skip
+        made[kind]()
+    files = len(os.listdir("/proc/self/fd"))
+    stop_note._settled_ns.clear()
     assert stopped(LOCK) is (kind == "root's")
+    remove_old(LOCK)
+    assert len(os.listdir("/proc/self/fd")) == files
 
 
 @pytest.mark.usefixtures("others")
-def test_the_newest_of_each_lock_stays_for_a_day(notes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_they_stay_for_a_day(notes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, umask = now_ns(), os.umask(0o077)
     monkeypatch.setattr(stop_note, "now_ns", lambda: now)
+    monkeypatch.setattr(stop_note, "_began_ns", lambda: 0)
     write_note("jointctl-bus-old")
     now += round(KEPT_S * 1e9)
     write_note("jointctl-bus-new")
-    for _ in range(3):
+    for _ in range(MOST + 3):
         write_note(LOCK)
         now += 1
     os.umask(umask)
-    remove_older(LOCK)
-    left = sorted(path.name.rpartition("-stop-")[0] for path in notes.iterdir())
-    assert left == ["jointctl-bus-new", LOCK]
-    assert [path.stat().st_mode & 0o777 for path in notes.iterdir()] == [0o644, 0o644]
-    started_ns = now - 2
-    monkeypatch.setattr(stop_note, "_started_ns", lambda: started_ns)
-    assert stopped(LOCK)
+    assert stopped("jointctl-bus-new")
+    assert not stopped("jointctl-bus-old")
+    remove_old(LOCK)
+    left = [path.name.rpartition("-stop-") for path in notes.iterdir()]
+    assert sorted(lock for lock, *_ in left) == ["jointctl-bus-new", *[LOCK] * MOST]
+    assert {path.stat().st_mode & 0o777 for path in notes.iterdir()} == {0o644}
+    assert max(int(name.split("-")[0]) for *_, name in left) == now - 1
 
 
 def test_a_note_that_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

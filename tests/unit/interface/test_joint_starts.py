@@ -20,10 +20,9 @@ pytestmark = pytest.mark.usefixtures("old_program")
 @pytest.fixture
 def old_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It was started an hour ago, and the stops are another's."""
-    monkeypatch.setattr(stop_note, "FOLDER", tmp_path)
-    monkeypatch.setattr(stop_note, "_asked_ns", None)
-    monkeypatch.setattr(stop_note, "_served", set())
-    monkeypatch.setattr(stop_note, "_started_ns", lambda: now_ns() - 3600 * 10**9)
+    for name, value in (("FOLDER", tmp_path), ("_asked_ns", None), ("_settled_ns", {})):
+        monkeypatch.setattr(stop_note, name, value)
+    monkeypatch.setattr(stop_note, "_began_ns", lambda: now_ns() - 3600 * 10**9)
     monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
 
 
@@ -41,22 +40,25 @@ def stop(path: Path) -> None:
     write_note(lock_name("jointctl", str(path.parent / "no-one")))
 
 
-def test_it_counts_from_the_line_with_the_joint_on_while_that_loads(
-    joint_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_counts_wherever_the_program_is(joint_file: Path) -> None:
     """A stop in the seconds before the `with` block said that the drive was off, and the joint moved afterwards."""
-    from jointctl import program
-
-    load = program.wanted_source
-    monkeypatch.setattr(program, "wanted_source", lambda *given: (stop(joint_file), load(*given))[1])
     joint = Joint(joint_file)
-    monkeypatch.setattr(program, "wanted_source", load)
-    Joint(joint_file)  # of the same program, and later: each counts by its own line
+    stop(joint_file)
     with pytest.raises(MotionFault, match="stopped by jointctl stop before it began; nothing has moved"):
         joint.__enter__()
-
-
-def test_its_twin_one_that_came_before_is_another_matter(joint_file: Path) -> None:
-    stop(joint_file)
-    with pytest.raises(AssertionError, match="it has begun"):
+    with pytest.raises(AssertionError, match="it has begun"):  # once: its user knows of it by now
         Joint(joint_file).__enter__()
+    stop(joint_file)
+    with pytest.raises(MotionFault, match="stopped by jointctl stop before it began; nothing has moved"):
+        Joint(joint_file).__enter__()
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_stop_of_its_own_is_one_of_what_it_has_asked_for_before(
+    joint_file: Path, monkeypatch: pytest.MonkeyPatch, before: bool
+) -> None:
+    monkeypatch.setattr(stop_note, "_ancestors", lambda pid: iter((pid,)))
+    joint = None if before else Joint(joint_file)
+    stop(joint_file)
+    with pytest.raises(AssertionError if before else MotionFault):
+        (joint or Joint(joint_file)).__enter__()

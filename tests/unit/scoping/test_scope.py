@@ -8,6 +8,7 @@ import json
 import math
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +18,10 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from jointctl.drivers import stop_note
+from jointctl.drivers.bus_lock import lock_name
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import DECLINED, DataError, MotionFault, UsageError
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, DataError, MotionFault, UsageError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
@@ -696,3 +699,38 @@ def test_the_end_of_a_run_is_told_until_the_next_is_prepared(monkeypatch: pytest
     feed.settings(ended)
     scope_module._wait_for_prepare(feed, ended)
     assert feed.told == [ended] * 3
+
+
+@pytest.mark.parametrize("when", ["before it", "between two runs"])
+def test_a_stop_before_the_page_has_the_bus_ends_it_and_one_before_prepare_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, virtual_config: Any, when: str
+) -> None:
+    for name, value in (("FOLDER", tmp_path), ("_anew_ns", 0), ("_settled_ns", {})):
+        monkeypatch.setattr(stop_note, name, value)
+    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))  # the stops are another's
+    lock, runs = lock_name(virtual_config.bus.interface, virtual_config.bus.channel), []
+
+    class Runs(Session):
+        def run(self) -> None:
+            runs.append(when)
+            if len(runs) == 2:
+                raise KeyboardInterrupt
+
+    @contextmanager
+    def server(*_: Any, **__: Any) -> Iterator[Any]:
+        yield Feed()
+
+    monkeypatch.setattr("jointctl.tools.session.session.Session", Runs)
+    monkeypatch.setattr("jointctl.tools.scoping.feed.scope_server", server)
+    monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
+    monkeypatch.setattr(scope_module, "_wait_for_prepare", lambda *_: stop_note.write_note(lock))
+    if when == "before it":
+        stop_note.write_note(lock)
+    err = io.StringIO()
+    code = scope_module.live_scope(virtual_config, Output(stderr=err))
+    if when == "before it":
+        assert (code, runs) == (INTERRUPTED, [])
+        assert "scope ended by jointctl stop; nothing moved" in err.getvalue()
+    else:
+        assert len(runs) == 2
+        assert "by jointctl stop" not in err.getvalue()
