@@ -163,6 +163,20 @@ def test_a_process_that_does_a_part_of_the_work_began_with_the_program(method: s
         assert pool.submit(stopped_in, notes).result()
 
 
+@pytest.mark.usefixtures("others")
+@pytest.mark.parametrize(("parents_pid", "found"), [(None, False), (10, True), (11, False)])
+def test_the_process_that_shares_its_work_is_asked_for_its_date(
+    monkeypatch: pytest.MonkeyPatch, parents_pid: int | None, found: bool
+) -> None:
+    write_note(LOCK)
+    parent = None if parents_pid is None else SimpleNamespace(pid=parents_pid)
+    monkeypatch.setattr("multiprocessing.process.parent_process", lambda: parent)
+    later_ns = now_ns()
+    monkeypatch.setattr(stop_note, "_first_ns", later_ns)
+    monkeypatch.setattr(stop_note, "_started_ns", lambda pid: {10: later_ns - 10**9, 11: 0}.get(pid, later_ns))
+    assert stopped(LOCK) is found
+
+
 def stopped_in(notes: Path) -> bool:
     stop_note.FOLDER = notes
     return stopped(LOCK)
@@ -290,6 +304,15 @@ def test_a_note_that_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, 
     assert "just starting" in told[0]
     assert "No such file" in told[0]
     assert not stopped(LOCK)
+    files = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(stop_note, "FOLDER", tmp_path)
+    write_note(LOCK)
+    full = SimpleNamespace(**{**vars(os), "write": lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))})
+    monkeypatch.setattr(stop_note, "os", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_note(LOCK)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert len(os.listdir("/proc/self/fd")) == files
 
 
 @pytest.mark.usefixtures("others")
