@@ -431,13 +431,15 @@ class StopCall:
     def __init__(self, interface: str, channel: str) -> None:
         self._place, self._name = (interface, channel), lock_name(interface, channel)
         self._unnoted: OSError | None = None
+        self._noted_ns = 0
         self._note()
         self._ask()
 
     def _note(self) -> None:
+        """The first one is for all that run, the second one for those that were started since."""
         try:
             if _has_lock(self._place[0]):
-                write_note(self._name)
+                self._noted_ns = write_note(self._name, self._noted_ns)
         except OSError as error:
             self._unnoted = error
 
@@ -459,7 +461,7 @@ class StopCall:
         `ended` is called each time a controller has: it may have enabled the drive before.
         """
         self._end_controllers(note, ended)
-        self._note()  # for those that were started in the meantime
+        self._note()
         self._ask_again()
         self._end_controllers(note, ended)
         if self._unnoted is not None:

@@ -27,6 +27,7 @@ _LONGEST = 4096  # bytes of a note
 
 class _Note(NamedTuple):
     time_ns: int
+    began_ns: int  # it is for those that began since then; 0 = for all
     by: frozenset[str]  # the process of that stop, and those that it descends from, as `_process`
 
 
@@ -57,22 +58,23 @@ def settle(lock: str) -> None:
     _settled_ns[lock] = now_ns()
 
 
-def write_note(lock: str) -> None:
-    """From now on no program that runs already gets on with this lock unseen; `OSError` if it cannot be kept.
+def write_note(lock: str, began_ns: int = 0) -> int:
+    """From now on no program that runs already, and began after `began_ns`, gets on with this lock unseen; its time.
 
-    Loads and looks for nothing: the drive is still to be stopped.
+    `OSError` if it cannot be kept.  Loads and looks for nothing: the drive is still to be stopped.
     """
     written_ns = now_ns()
     path = FOLDER / f"{_prefix(lock)}{written_ns}-{os.getpid()}"
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
         os.fchmod(fd, 0o644)  # whatever the umask: root's counts for everyone
-        os.write(fd, " ".join((str(written_ns), *map(_process, _ancestors(os.getpid())))).encode())
+        os.write(fd, " ".join((str(written_ns), str(began_ns), *map(_process, _ancestors(os.getpid())))).encode())
     except BaseException:
         path.unlink()
         raise
     finally:
         os.close(fd)
+    return written_ns
 
 
 def remove_old(lock: str) -> None:
@@ -94,7 +96,7 @@ def stopped(lock: str) -> bool:
     settled_ns, began_ns = _settled_ns.get(lock, 0), max(_began_ns(), _anew_ns)
     found = False
     for note in filter(None, map(_read, _files(lock))):
-        if not _counts(note):
+        if not _counts(note) or began_ns < note.began_ns:
             continue
         since_ns = began_ns
         if me in note.by:
@@ -126,8 +128,8 @@ def _read(path: Path) -> _Note | None:
             ours = stat.S_ISREG(about.st_mode) and about.st_uid in (os.geteuid(), 0)
             # a file that others may write to, or have linked to this name, is no one's
             if ours and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and about.st_nlink == 1:
-                first, *by = os.read(fd, _LONGEST).decode("ascii").split()
-                return _Note(int(first), frozenset(by))
+                time_ns, began_ns, *by = os.read(fd, _LONGEST).decode("ascii").split()
+                return _Note(int(time_ns), int(began_ns), frozenset(by))
         finally:
             os.close(fd)
     return None

@@ -142,6 +142,18 @@ def test_one_that_has_reached_the_holder_of_the_lock_is_known_to_it() -> None:
 
 
 @pytest.mark.usefixtures("others")
+@pytest.mark.parametrize(("ago_s", "found"), [(10.0, False), (4.0, True)])
+def test_the_note_at_the_end_of_a_stop_is_for_those_that_were_started_since(
+    monkeypatch: pytest.MonkeyPatch, ago_s: float, found: bool
+) -> None:
+    """A program whose run the stop has ended may begin another one: it knows of that stop."""
+    started(monkeypatch, ago_s)
+    settle(LOCK)
+    write_note(LOCK, now_ns() - 5 * 10**9)
+    assert stopped(LOCK) is found
+
+
+@pytest.mark.usefixtures("others")
 def test_what_was_before_a_users_new_request_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the page: "Prepare"."""
     started(monkeypatch, 3600.0)
@@ -326,3 +338,22 @@ def test_the_lock_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_lock.sys, "platform", "darwin")  # no locks, and no notes
     with BusLock("socketcan", channel) as lock, StopCall("socketcan", channel):
         assert not lock.stopped
+
+
+@pytest.mark.usefixtures("others")
+def test_a_stop_notes_when_it_begins_and_when_it_ends_and_clears_away(
+    notes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = now_ns()
+    monkeypatch.setattr(stop_note, "now_ns", lambda: now)
+    write_note("jointctl-bus-old")
+    now += round(KEPT_S * 1e9) + 1
+    with StopCall("socketcan", "tested-two-notes") as call:
+        written = {now}
+        assert [int(path.read_bytes().split()[0]) for path in notes.glob(f"{call._name}*")] == [now]
+        now += 1000  # a program has been started since
+        call.end(pytest.fail)
+    assert {int(path.read_bytes().split()[0]) for path in notes.iterdir()} == {*written, now}
+    with StopCall("virtual", "x") as call:  # python-can's own: no one else can be on it
+        call.end(pytest.fail)
+    assert len(list(notes.iterdir())) == 2

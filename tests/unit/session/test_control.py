@@ -258,11 +258,12 @@ class Computer:
         self.signals: list[tuple[list[int], str, float]] = []
         self.notes: list[str] = []
         self.ended_s: list[float] = []  # when the drive is switched off once more
+        self.awaited: list[list[Program]] = []
         for program in (program for look in holders for program in look):
             program.computer = self
         monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
         monkeypatch.setattr(bus_lock, "lock_holders", lambda *_: self.holders.pop(0) if self.holders else [])
-        monkeypatch.setattr(bus_lock, "wait_for_answers", lambda _: None)
+        monkeypatch.setattr(bus_lock, "wait_for_answers", lambda asked: self.awaited.append(list(asked)))
         monkeypatch.setattr(bus_lock, "is_marked", self.is_marked)
         monkeypatch.setattr(
             bus_lock, "marked_processes", lambda name: [pid for pid in self.marks[name] if self.is_marked(pid, name)]
@@ -346,6 +347,17 @@ def test_a_controller_that_came_after_the_request_gets_one_of_its_own(
     assert later.log == ["stop", "closed"]
     assert all(program.log == ["stop", "closed"] for program in first)
     assert computer.signals == []
+    assert computer.awaited[:2] == [first, [later]]
+
+
+def test_one_that_has_the_lock_only_when_all_is_over_is_ended_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drive is switched off once more: it may have enabled it."""
+    later = Program(leaves_s=1.5, within_s=8.0)
+    computer = Computer(monkeypatch, [], [later])
+    assert computer.stopped()
+    assert later.log == ["stop", "closed"]
+    assert computer.awaited == [[], [later]]
+    assert computer.ended_s == [pytest.approx(1.5, abs=0.03)]
 
 
 def test_a_controller_that_was_asked_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
