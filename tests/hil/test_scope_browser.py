@@ -287,6 +287,9 @@ def test_a_refused_set_point_is_told_at_its_field(bench: Any, browser: Browser) 
     assert tab.js(CONTRASTS) == ""
     tab.enter("set-point", "0.1")
     tab.until(f"!{field}.innerText.includes('must be in')")
+    tab.enter("set-point", "")
+    tab.click("go")
+    tab.until(f"{field}.innerText.includes('position_rad is empty: must be a number')")
 
 
 def test_stop_before_start_ends_the_preparation(bench: Any, browser: Browser) -> None:
@@ -315,6 +318,55 @@ def test_pause_zoom_and_trigger(bench: Any, browser: Browser) -> None:
     held = tab.js(LAST_s)
     time.sleep(1.0)
     assert tab.js(LAST_s) == held
+
+
+def is_on(tab: Tab, name: str) -> bool:
+    """Of a switch or a box."""
+    return bool(tab.js(f"document.querySelector('[data-testid=\"{name}\"]').getAttribute('aria-checked') === 'true'"))
+
+
+def test_what_is_chosen_between_two_runs_is_for_the_next_one(bench: Any, browser: Browser) -> None:
+    _, tab, _ = opened(bench, browser)
+    start(tab)
+    moves(tab)
+    time.sleep(9.0)  # through the angle's zero crossing, and half a span further
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    tab.click("trigger")
+    state_is(tab, "ready; nothing moves")
+    assert is_on(tab, "trigger")  # the crossing of the run before does not count
+    start(tab)
+    moves(tab)
+    tab.until("document.querySelector('[data-testid=\"pause\"]').getAttribute('aria-checked') === 'true'", 40.0)
+    assert not is_on(tab, "trigger")
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    state_is(tab, "ready; nothing moves")
+    start(tab)
+    moves(tab)  # what was held is gone
+    assert not is_on(tab, "pause")
+
+
+def test_no_choice_is_lost_to_a_page_that_answers_late(bench: Any, browser: Browser) -> None:
+    scope, tab, url = opened(bench, browser)
+    server = scope.child("jointctl.tools.scoping.server")
+    tab.js("document.querySelector('[data-testid=\"signals\"]').click(); null")
+    items = "[...document.querySelectorAll('.q-menu .q-item')]"
+    tab.until(f"{items}.length > 5")
+    os.kill(server, signal.SIGSTOP)
+    for name in ("velocity [rad/s]", "error [mrad]"):
+        tab.js(f"{items}.find(item => item.innerText === '{name}').click(); null")
+        time.sleep(0.2)
+    os.kill(server, signal.SIGCONT)
+    start(tab)
+    shown = f"{ZOOM}.getOption().series.map(one => one.name).join()"
+    tab.until(f"{shown} === 'desired angle [rad],angle [rad],command torque [Nm],velocity [rad/s],error [mrad]'")
+    new = browser.open(url)  # whose colours are asked for while it comes up
+    new.click("dark")
+    time.sleep(2.0)
+    assert new.js("document.body.classList.contains('body--dark')")
 
 
 def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) -> None:

@@ -394,8 +394,8 @@ class ScopePage:
         self._draw_again_s = 0.0
         client: Any = ui.context.client
         self._who = viewer(getattr(client, "ip", None))
-        self._dark = ui.dark_mode(False)
-        client.on_connect(self._follow_system)
+        self._dark, self._dark_chosen = ui.dark_mode(False), False
+        client.on_connect(self._on_connect)
         ui.colors(primary="#1f5fa8")
         ui.add_css(CSS)
         self._build()
@@ -427,12 +427,16 @@ class ScopePage:
                 self._changes = None
         self._dark_switch = ui.switch("dark", on_change=self._on_dark).props('dense data-testid="dark"')
 
-    async def _follow_system(self) -> None:
-        """Dark where the viewer's system is, until the switch is used."""
+    async def _on_connect(self) -> None:
+        """Or was cut off for a moment.  Dark where the viewer's system is, until the switch is used."""
+        self._chart.resend_choice()
         with contextlib.suppress(TimeoutError):
-            self._dark_switch.value = bool(await ui.run_javascript(_PREFERS_DARK))
+            prefers_dark = bool(await ui.run_javascript(_PREFERS_DARK))
+            if not self._dark_chosen:
+                self._dark_switch.value = prefers_dark
 
     def _on_dark(self) -> None:
+        self._dark_chosen = True
         self._dark.value = bool(self._dark_switch.value)
         self._chart.dark(self._dark.value)
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import DECLINED, DataError, MotionFault, UsageError
+from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, MotionFault, UsageError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
@@ -34,7 +34,7 @@ from jointctl.tools.scoping.server import COOKIE, allowed, cookie_name
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest, time_left
-from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, new_motion
+from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, checked_gains, new_motion
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.session.session import Session
@@ -632,6 +632,19 @@ def test_a_motion_without_an_end_says_so(
     around = Around(StopSignals(), BusWatch(virtual_config, None))
     RunWatch(resolve(virtual_config), axis[0], RunParts(loop, around, sink, sink, display, {})).take_records()
     assert (time_left(1e4, shown[0].duration_s, AxisPhase.TRACKING) == "until stopped") is not ends
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(None, "trajectory.position_rad is empty: must be a number"),
+     ("x", "trajectory.position_rad (=x) must be a number")],
+)  # fmt: skip
+def test_an_empty_field_is_refused_as_such(virtual_config: Any, value: object, words: str) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        new_motion(virtual_config, TABLE, {"kind": "hold", "duration_s": 0.0, "position_rad": value})
+    assert refused.value.message == words
+    with pytest.raises(ConfigurationError, match=r"^control.kp (is empty:|\(=x\)) must be in \[392..1568\]"):
+        checked_gains({"kp": value}, {"kp": 784.0}, {"kp": 392.0}, {"kp": 1568.0})
 
 
 # --- before Start, and after the end ---
