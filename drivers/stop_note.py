@@ -31,6 +31,7 @@ class _Note(NamedTuple):
 _asked_ns: int | None = (
     None  # when this process was asked for what it does; None = when it was started, as each verb is
 )
+_by_hand = False  # whether nothing that came before that counts
 _served: set[str] = set()  # locks that it has had, or has given up for a note
 
 
@@ -39,13 +40,14 @@ def now_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def asked(at_ns: int) -> None:
+def asked(at_ns: int, *, by_hand: bool = False) -> None:
     """This process was asked by its user at `at_ns`, for the lock that it takes next.
 
-    For what lives on from one request to the next: a Python program, a page.
+    For what lives on from one request to the next: a Python program, a page.  `by_hand`: by a press, so that a stop
+    before it does not count, though the process was started before that.
     """
-    global _asked_ns
-    _asked_ns = at_ns
+    global _asked_ns, _by_hand
+    _asked_ns, _by_hand = at_ns, by_hand
 
 
 def write_note(lock: str) -> None:
@@ -87,7 +89,7 @@ def stopped(lock: str) -> bool:
         since_ns = started_ns
         if pid in note.by:
             since_ns = _asked_ns if _asked_ns is not None else note.time_ns + 1
-        elif _asked_ns is not None and (not first or note.time_ns > started_ns + STARTING_S * 1e9):
+        elif _asked_ns is not None and (_by_hand or not first or note.time_ns > started_ns + STARTING_S * 1e9):
             since_ns = _asked_ns
         if note.time_ns >= since_ns:
             return True

@@ -56,6 +56,13 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
     # with a browser beside it the loop may stand still for milliseconds: that is not what these tests are about
     config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0, **changes)
     bench.joint(config)
+    scope, tab, url = page_of(bench, browser, config, *options)
+    state_is(tab, "ready; nothing moves")
+    return scope, tab, url
+
+
+def page_of(bench: Any, browser: Browser, config: str, *options: str) -> tuple[Any, Tab, str]:
+    """`jointctl scope CONFIG` and its page, whatever it shows."""
     port = free_port()
     scope = bench.start("scope", config, "--port", str(port), *options, env=environment()).saw("token=")
     url = printed_address(scope)
@@ -67,9 +74,7 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
         except OSError:
             assert time.monotonic() < give_up, scope.err
             time.sleep(0.2)
-    tab = browser.open(url)
-    state_is(tab, "ready; nothing moves")
-    return scope, tab, url
+    return scope, browser.open(url), url
 
 
 def printed_address(scope: Any) -> str:
@@ -170,6 +175,57 @@ def test_a_stop_that_does_not_arrive_is_told(bench: Any, browser: Browser) -> No
     os.kill(server, signal.SIGKILL)
     done = scope.finished(30.0)
     done.refused(done.code, "the scope's web server has ended")
+    assert bench.disabled()
+
+
+def panel(tab: Tab) -> str:
+    """What the panel with Start and Prepare shows."""
+    return str(tab.js("document.querySelector('[data-testid=\"start-panel\"]').innerText"))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, browser: Browser, moving: bool) -> None:
+    scope, tab, _ = opened(bench, browser)
+    if moving:
+        start(tab)
+        moves(tab)
+    stopped = bench.run("stop", "joint.toml")
+    assert (stopped.code, stopped.out) == (0, "the drive is switch on disabled\n"), stopped
+    assert scope.finished(20.0).code == 130
+    assert bench.disabled()
+    state_is(tab, "jointctl has ended")
+    assert "operation enabled" not in tab.text("state")
+    words = "stopped  by jointctl stop" if moving else "scope ended by jointctl stop; the drive is disabled"
+    assert words in panel(tab)
+    assert "Prepare" not in panel(tab)  # no one would take it
+    assert "Start" not in panel(tab)
+    time.sleep(4.0)
+    assert tab.js("document.querySelector('[data-testid=\"stale\"]').style.display") == "none"  # nothing may move
+
+
+def test_what_is_prepared_after_a_stop_is_a_new_run(bench: Any, browser: Browser) -> None:
+    config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("tracking")
+    scope, tab, _ = page_of(bench, browser, config)
+    tab.until("document.querySelector('[data-testid=\"start-panel\"]').innerText.includes('another program controls')")
+    assert bench.run("stop", config).code == 0
+    assert run.finished(20.0).code == 130
+    tab.click("prepare")  # within the first minute of the page's program
+    state_is(tab, "ready; nothing moves")
+    tab.click("stop")
+    state_is(tab, "not started; the drive is disabled")
+    assert bench.run("stop", config).code == 0  # the page controls nothing, and goes on
+    tab.click("prepare")
+    state_is(tab, "ready; nothing moves")
+    start(tab)
+    moves(tab)
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    assert bench.run("stop", config).code == 0  # after the press
+    scope.saw("scope ended by jointctl stop", 20.0)
+    assert scope.finished(20.0).code == 130
     assert bench.disabled()
 
 

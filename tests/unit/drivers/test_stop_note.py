@@ -27,6 +27,7 @@ def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of its own, for a process that has not been asked for anything yet."""
     monkeypatch.setattr(stop_note, "FOLDER", tmp_path)
     monkeypatch.setattr(stop_note, "_asked_ns", None)
+    monkeypatch.setattr(stop_note, "_by_hand", False)
     monkeypatch.setattr(stop_note, "_served", set())
     return tmp_path
 
@@ -125,6 +126,17 @@ def test_one_that_has_just_been_started_was_started_for_its_joint(
     assert stopped(LOCK) is found
     asked(now_ns())  # once more: it knows of that stop by now
     assert not stopped(LOCK)
+
+
+@pytest.mark.usefixtures("others")
+def test_a_press_comes_after_every_stop_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page of a minute ago, whose first run did not get the bus: its user has stopped the program that had it."""
+    started(monkeypatch, 59.0)
+    write_note(LOCK)
+    asked(now_ns(), by_hand=True)
+    assert not stopped(LOCK)
+    write_note(LOCK)
+    assert stopped(LOCK)
 
 
 @pytest.mark.parametrize("way", ["itself", "child"])

@@ -22,6 +22,7 @@ def old_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It was started an hour ago, and the stops are another's."""
     monkeypatch.setattr(stop_note, "FOLDER", tmp_path)
     monkeypatch.setattr(stop_note, "_asked_ns", None)
+    monkeypatch.setattr(stop_note, "_by_hand", False)
     monkeypatch.setattr(stop_note, "_served", set())
     monkeypatch.setattr(stop_note, "_started_ns", lambda: now_ns() - 3600 * 10**9)
     monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))

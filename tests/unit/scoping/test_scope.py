@@ -19,6 +19,7 @@ import pytest
 
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, MotionFault, UsageError
+from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
@@ -668,7 +669,12 @@ class Feed:
         last = self.told[-1]
         if last["stage"] == "ready":
             return [ViewerRequest("start", "a viewer", {"number": last["number"], "clear": True})]
-        return [ViewerRequest("prepare", "a viewer", {})] if self.told.count(last) >= 3 else []
+        if self.told.count(last) < 3:
+            return []
+        self.pressed()
+        return [ViewerRequest("prepare", "a viewer", {})]
+
+    def pressed(self) -> None: ...
 
 
 @pytest.mark.parametrize("refused", [True, False])
@@ -707,5 +713,8 @@ def test_the_end_of_a_run_is_told_until_the_next_is_prepared(monkeypatch: pytest
     feed: Any = Feed()
     ended = {"stage": "ended", "lines": ["log"]}
     feed.settings(ended)
-    scope_module._wait_for_prepare(feed, ended)
+    before_ns, pressed_ns = now_ns(), []
+    monkeypatch.setattr(feed, "pressed", lambda: pressed_ns.append(now_ns()))
+    asked_ns = scope_module._wait_for_prepare(feed, ended)
     assert feed.told == [ended] * 3
+    assert before_ns < asked_ns < pressed_ns[0]  # a stop that comes right after the press is later
