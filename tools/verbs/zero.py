@@ -6,9 +6,13 @@ homing is disturbed, and the old value is in the file's history.
 
 from __future__ import annotations
 
+import codecs
 import math
 import time
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -50,8 +54,6 @@ def zero(
 ) -> int:
     """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
-    from jointctl.tools.configuration.load import load_config, read_text
-    from jointctl.tools.inspection.first_values import filled
     from jointctl.tools.session.plan import agreed, require_terminal
     from jointctl.tools.written_file import replace_file
 
@@ -79,19 +81,40 @@ def zero(
         "angle_before_rad": found[0].angle_rad, "angle_after_rad": angle_rad,
         "zero_counts": {each.section: {"before": each.before, "after": each.after} for each in found},
     }  # fmt: skip
+    if not limits.position_min_rad <= angle_rad <= limits.position_max_rad:
+        output.warning(
+            f"at {angle_rad:+.4f} rad the joint is outside of limits.position_*_rad, and will not be enabled"
+        )
+    content = _with_zeros(config.path, found)
     if not (assume_yes or agreed(output, f"Write {config.path}?")):
         output.note("nothing was changed")
         return DECLINED
-    text = filled(read_text(config.path), {(each.section, "zero_counts"): each.after for each in found})
-
-    def loads(path: object) -> None:
-        written = load_config(str(path))
-        if written.encoder.zero_counts != found[0].after:
-            raise ConfigurationError(f"{config.path}: encoder.zero_counts is written in a way that is not understood")
-
-    replace_file(config.path, text.encode(), loads)
+    replace_file(config.path, content)
     output.result(f"{config.path}: the joint is at {angle_rad:+.4f} rad here", data)
     return 0
+
+
+def _with_zeros(path: Path, found: Sequence[Zero]) -> bytes:
+    """The file with the new zeros, and everything else as it is; `ConfigurationError` where that cannot be."""
+    from jointctl.firmware_py.input_file import parse_toml
+    from jointctl.tools.configuration.load import config_of, read_document
+    from jointctl.tools.inspection.first_values import filled
+
+    text, wanted = read_document(path)
+    for each in found:
+        wanted[each.section]["zero_counts"] = each.after
+    text = filled(text, {(each.section, "zero_counts"): each.after for each in found}, marked=False)
+    try:
+        as_wanted = parse_toml(text) == wanted
+    except tomllib.TOMLDecodeError:
+        as_wanted = False
+    if not as_wanted:
+        places = " and ".join(f"`zero_counts = {each.before}` below [{each.section}]" for each in found)
+        raise ConfigurationError(
+            f"{path}: zero_counts is written in a way that is not understood", f"write it as {places}, and try again"
+        )
+    config_of(path, text, wanted)  # as it will be read: the number may be too large
+    return (codecs.BOM_UTF8 if path.read_bytes().startswith(codecs.BOM_UTF8) else b"") + text.encode()
 
 
 def _readings(config: Config, angle_rad: float) -> list[Zero]:

@@ -97,11 +97,49 @@ def test_what_is_refused(tmp_path: Path, joint: DeviceOnBus) -> None:
         zero(config_on(tmp_path, joint, drive__node=9), output()[0], assume_yes=True)
 
 
-def test_a_zero_written_in_a_way_that_is_not_understood_leaves_the_file(tmp_path: Path, joint: DeviceOnBus) -> None:
+@pytest.mark.parametrize("line", ['"zero_counts" = 0', " zero_counts = 0"])
+def test_a_zero_written_in_a_way_that_is_not_understood_leaves_the_file(
+    tmp_path: Path, joint: DeviceOnBus, line: str
+) -> None:
     config = config_on(tmp_path, joint)
-    text = config.path.read_text()
-    config.path.write_text(text.replace("zero_counts = 0", '"zero_counts" = 0', 1))
-    with pytest.raises(ConfigurationError, match="in a way that is not understood"):
+    text = config.path.read_text().replace("zero_counts = 0", line, 1)
+    config.path.write_text(text)
+    with pytest.raises(ConfigurationError, match="in a way that is not understood") as refused:
         zero(load_config(config.path), output()[0], assume_yes=True)
-    assert '"zero_counts" = 0' in config.path.read_text()
+    assert refused.value.hint == "write it as `zero_counts = 0` below [encoder], and try again"
+    assert config.path.read_text() == text
     assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_only_the_number_changes_in_a_file_of_any_habit(tmp_path: Path, joint: DeviceOnBus) -> None:
+    config = config_on(tmp_path, joint)
+    file, link = tmp_path / "real.toml", tmp_path / "link.toml"
+    text = config.path.read_text()
+    own = next(line for line in text.splitlines() if line.startswith("zero_counts = 0"))
+    kept, given = "# zero_counts = 77    # in May", "zero_counts=+0  # 4 counts = 1 mm"
+    before = "\ufeff" + text.replace(own, f"{kept}\n{given}").replace("\n", "\r\n")
+    file.write_bytes(before.encode())
+    file.chmod(0o640)
+    link.symlink_to(file.name)
+    assert zero(load_config(link), output()[0], assume_yes=True) == 0
+    assert link.is_symlink()
+    assert file.stat().st_mode & 0o777 == 0o640
+    after = file.read_bytes().decode()
+    assert after == before.replace(given, f"{'zero_counts = 8344':<33} # 4 counts = 1 mm")
+
+
+@pytest.mark.parametrize(("angle_rad", "outside"), [(0.7, False), (0.71, True)])
+def test_a_joint_outside_of_its_limits_is_warned_of(
+    tmp_path: Path, joint: DeviceOnBus, angle_rad: float, outside: bool
+) -> None:
+    said, _, err = output()
+    assert zero(config_on(tmp_path, joint), said, angle_rad=angle_rad, assume_yes=True) == 0
+    assert ("the joint is outside of limits.position_*_rad" in err.getvalue()) is outside
+
+
+def test_a_zero_that_the_file_cannot_hold_is_refused(tmp_path: Path, joint: DeviceOnBus) -> None:
+    config = config_on(tmp_path, joint, encoder__counts_per_turn=2**26)
+    before = config.path.read_text()
+    with pytest.raises(ConfigurationError, match=r"encoder.zero_counts \(=-\d+\) must be in"):
+        zero(config, output()[0], angle_rad=600.0, assume_yes=True)
+    assert config.path.read_text() == before
