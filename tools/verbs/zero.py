@@ -55,13 +55,14 @@ def zero(
     """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.session.plan import agreed, require_terminal
-    from jointctl.tools.written_file import replace_file
+    from jointctl.tools.written_file import refuse_read_only, replace_file
 
     if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
         raise ConfigurationError(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
+    refuse_read_only(config.path)
     if not -math.tau * 100.0 <= angle_rad <= math.tau * 100.0:
         raise ConfigurationError(f"--angle (={angle_rad:g}) must be in [-628..628] rad")
     if not assume_yes:
@@ -85,11 +86,13 @@ def zero(
         output.warning(
             f"at {angle_rad:+.4f} rad the joint is outside of limits.position_*_rad, and will not be enabled"
         )
-    content = _with_zeros(config.path, found)
-    if not (assume_yes or agreed(output, f"Write {config.path}?")):
-        output.note("nothing was changed")
-        return DECLINED
-    replace_file(config.path, content)
+    _with_zeros(config.path, found)  # what cannot be done is refused before the question
+    if not assume_yes:
+        if not agreed(output, f"Write {config.path}?"):
+            output.note("nothing was changed")
+            return DECLINED
+        _require_still(config, _readings(config, angle_rad), [each.counts for each in found])
+    replace_file(config.path, _with_zeros(config.path, found))  # of the file as it is by now
     output.result(f"{config.path}: the joint is at {angle_rad:+.4f} rad here", data)
     return 0
 
@@ -141,16 +144,22 @@ def _readings(config: Config, angle_rad: float) -> list[Zero]:
         first = [_counts(readers[number], *place) for _, number, place, _, _ in places]
         time.sleep(_APART_S)
         counts = [_counts(readers[number], *place) for _, number, place, _, _ in places]
-    for (section, *_, scale), before, after in zip(places, first, counts, strict=True):
-        travel = max(abs(after - before) - _NOISE_COUNTS, 0) * abs(scale)
-        if travel > config.limits.standstill_radps * _APART_S:
-            raise DeviceError(
-                f"the joint moves: [{section}] went from {before} to {after} in {_APART_S:g} s", "hold it"
-            )
-    return [
+    found = [
         Zero(section, now, was, round(now - angle_rad / scale), scale)
         for (section, _, _, was, scale), now in zip(places, counts, strict=True)
     ]
+    _require_still(config, found, first, f" in {_APART_S:g} s")
+    return found
+
+
+def _require_still(config: Config, found: Sequence[Zero], before: Sequence[int], within: str = "") -> None:
+    """`DeviceError` where an encoder has other counts than `before`, by more than its noise."""
+    for each, counts in zip(found, before, strict=True):
+        travel = max(abs(each.counts - counts) - _NOISE_COUNTS, 0) * abs(each.rad_per_count)
+        if travel > config.limits.standstill_radps * _APART_S:
+            raise DeviceError(
+                f"the joint moves: [{each.section}] went from {counts} to {each.counts}{within}", "hold it"
+            )
 
 
 def _counts(reader: SdoReader, index: int, sub: int) -> int:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from jointctl.drivers.errors import DECLINED, ConfigurationError, DeviceError, NoDeviceError, UsageError
+from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError, NoDeviceError, UsageError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs.zero import zero
@@ -86,6 +89,51 @@ def test_no_changes_nothing(tmp_path: Path, joint: DeviceOnBus, monkeypatch: pyt
     monkeypatch.setattr(sys, "stdin", stdin)
     assert zero(config, output()[0]) == DECLINED
     assert config.path.read_text() == before
+
+
+def answered(monkeypatch: pytest.MonkeyPatch, first: Callable[[], None]) -> None:
+    """The user says yes, after `first`."""
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+        def readline(self, *_: Any) -> str:
+            first()
+            return "y\n"
+
+    monkeypatch.setattr(sys, "stdin", Terminal())
+
+
+def test_what_happens_while_it_asks_counts(tmp_path: Path, joint: DeviceOnBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_on(tmp_path, joint)
+    text = config.path.read_text()
+    answered(monkeypatch, lambda: joint.sequences.update({(0x6064, 0): [20_000, 20_000]}))
+    with pytest.raises(DeviceError, match=r"the joint moves: \[encoder\] went from 8344 to 20000 "):
+        zero(config, output()[0])
+    assert config.path.read_text() == text
+    joint.sequences.clear()
+
+    def edit() -> None:
+        config.path.write_text(text + "# remembered while it asked\n")
+
+    answered(monkeypatch, edit)
+    assert zero(config, output()[0]) == 0
+    assert config.path.read_text() == text.replace("zero_counts = 0   ", "zero_counts = 8344") + (
+        "# remembered while it asked\n"
+    )
+
+
+def test_a_protected_file_stays_and_nothing_is_asked(
+    tmp_path: Path, joint: DeviceOnBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_on(tmp_path, joint)
+    text = config.path.read_text()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != config.path)
+    with pytest.raises(DataError, match=r"mine.toml: cannot be written: no permission"):
+        zero(config, output()[0], assume_yes=True)
+    assert config.path.read_text() == text
+    assert joint.requests == []
 
 
 def test_what_is_refused(tmp_path: Path, joint: DeviceOnBus) -> None:
