@@ -31,7 +31,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -109,6 +109,7 @@ class BusLock:
         self.marker_fd: int | None = None  # to be handed to every process that acts for this program
         self.remarks: list[str] = []
         self.stopped = False
+        self._delivers = False  # whether a stop that comes reaches what the program does
         self._place = f"{interface}:{channel}"
         self._on_stop, self._within_s = on_stop, within_s
         self._server: socket.socket | None = None
@@ -121,6 +122,7 @@ class BusLock:
             self._take_free_name()
             self._wake, self._woken = socket.socketpair()
         except OSError:  # no such sockets here
+            self.stopped = stopped(self._name)
             return
         self._thread = threading.Thread(target=self._serve, name="bus lock", daemon=True)
         self._thread.start()
@@ -131,6 +133,18 @@ class BusLock:
         except BaseException:
             self.close()
             raise
+
+    def deliver(self) -> None:
+        """From now on the program does what a stop has asked for: those that have come need not be noted any more.
+
+        Before, it may yet leave with an error that says nothing of a stop.
+        """
+        self._delivers = True
+
+    def settle(self) -> None:
+        """The program ends because of a stop, of this bus or of another one that it has: it knows of all of them."""
+        if self._thread is not None:
+            settle(self._name)
 
     def close(self) -> None:
         """Leave the bus to others; may be called twice."""
@@ -254,7 +268,8 @@ class BusLock:
                     answer["refused"] = "this program belongs to another user"
                 else:
                     answer["within_s"] = self._within_s
-                    settle(self._name)
+                    if self._delivers:
+                        settle(self._name)
                     if self._on_stop is not None:
                         self._on_stop()
                         self._on_stop = None
@@ -412,6 +427,7 @@ def _program(pid: int) -> str:
 # processes.  After `end` nothing of it can enable the drive.
 
 
+LOOKS = 3  # at all buses, after their controllers have ended
 LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
 TERM_S = 1.0  # between SIGTERM and SIGKILL
 KILL_S = 2.0
@@ -455,28 +471,35 @@ class StopCall:
         for holder in self._holders:
             holder.close()
 
-    def end(self, note: Callable[[str], None], ended: Callable[[], None] = lambda: None) -> None:
-        """The processes of a controller have ended when this returns, or `note` got why not.
+    def end(self, note: Callable[[str], None], ended: Callable[[], None] = lambda: None) -> bool:
+        """The processes of a controller have ended when this returns, or `note` got why not.  Whether there was one.
 
         `ended` is called each time a controller has: it may have enabled the drive before.
         """
-        self._end_controllers(note, ended)
+        return self._end_controllers(note, ended)
+
+    def again(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
+        """As `end`, for what has been started since, or has taken the lock after the first request."""
         self._note()
         self._ask_again()
-        self._end_controllers(note, ended)
+        return self._end_controllers(note, ended)
+
+    def clear_away(self, note: Callable[[str], None]) -> None:
+        """Notes that count no longer; `note` gets why ours could not be written."""
         if self._unnoted is not None:
             note(
                 f"the stop cannot be noted for a program that is just starting ({self._unnoted}): "
                 "look whether there is one, and stop again when it runs"
             )
         elif _has_lock(self._place[0]):
-            remove_old(self._name)
+            with contextlib.suppress(OSError):
+                remove_old(self._name)
 
     def _ask_again(self) -> None:
         self.__exit__()
         self._ask()
 
-    def _end_controllers(self, note: Callable[[str], None], ended: Callable[[], None]) -> None:
+    def _end_controllers(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
         wait_for_answers(self._holders)
         marked = marked_processes(self._name)
         if marked and not any(holder.is_controller for holder in self._holders):  # it may have come after the request
@@ -500,6 +523,7 @@ class StopCall:
         self._end_by_force(note)
         if controllers or marked:
             ended()
+        return bool(controllers or marked)
 
     def _end_by_force(self, note: Callable[[str], None]) -> None:
         """SIGTERM, then SIGKILL, to every process that still acts for the controller."""
@@ -511,6 +535,20 @@ class StopCall:
             pids = _signalled(marked_processes(self._name), self._name, number, wait_s)
         if pids:
             note(f"process {', '.join(map(str, pids))} cannot be ended; the drive may be enabled again")
+
+
+def end_programs(
+    calls: Sequence[StopCall], note: Callable[[str], None], ended: Callable[[], None] = lambda: None
+) -> None:
+    """Of all buses, until no controller is found on any: while one ends, another may come on a bus that was free."""
+    for call in calls:
+        call.end(note, ended)
+    for _ in range(LOOKS):
+        found = [call.again(note, ended) for call in calls]
+        if not any(found):
+            break
+    for call in calls:
+        call.clear_away(note)
 
 
 def _signalled(pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:

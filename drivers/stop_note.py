@@ -11,6 +11,7 @@ from.  Those of this user and of root count, for a day.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 import sys
@@ -22,6 +23,7 @@ from typing import NamedTuple
 FOLDER = Path("/dev/shm")
 KEPT_S = 86_400.0  # no program takes so long from its start to its bus
 MOST = 64  # that are kept of a lock
+SHARED_S = 60.0
 _LONGEST = 4096  # bytes of a note
 
 
@@ -47,14 +49,14 @@ def asked(at_ns: int) -> None:
     _asked_ns = at_ns
 
 
-def asked_anew() -> None:
-    """A user, who knows of the stops before, has asked this process now: as by a button of the page."""
+def asked_anew(at_ns: int) -> None:
+    """A user, who knows of the stops before, has asked this process at `at_ns`: as by a button of the page."""
     global _anew_ns
-    _anew_ns = now_ns()
+    _anew_ns = at_ns
 
 
 def settle(lock: str) -> None:
-    """The stops of this lock until now have reached this process."""
+    """The stops of this lock until now have reached what this process does."""
     _settled_ns[lock] = now_ns()
 
 
@@ -68,7 +70,7 @@ def write_note(lock: str, began_ns: int = 0) -> int:
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
         os.fchmod(fd, 0o644)  # whatever the umask: root's counts for everyone
-        os.write(fd, " ".join((str(written_ns), str(began_ns), *map(_process, _ancestors(os.getpid())))).encode())
+        os.write(fd, " ".join((lock, str(written_ns), str(began_ns), *map(_process, _ancestors()))).encode())
     except BaseException:
         path.unlink()
         raise
@@ -88,11 +90,11 @@ def remove_old(lock: str) -> None:
 
 
 def stopped(lock: str) -> bool:
-    """Whether a stop has come that this process does not know of; to be called while it holds the lock.  Settles it.
+    """Whether a stop has come that this process does not know of (`settle`); to be called while it holds the lock.
 
     A stop that came from this process itself, as by `subprocess.run`, counts only after it has asked for the joint.
     """
-    at_ns, me = now_ns(), _process(os.getpid())
+    me = _process(os.getpid())
     settled_ns, began_ns = _settled_ns.get(lock, 0), max(_began_ns(), _anew_ns)
     found = False
     for note in filter(None, map(_read, _files(lock))):
@@ -102,7 +104,6 @@ def stopped(lock: str) -> bool:
         if me in note.by:
             since_ns = _asked_ns if _asked_ns is not None else note.time_ns + 1
         found = found or (note.time_ns > settled_ns and note.time_ns >= since_ns)
-    _settled_ns[lock] = at_ns
     return found
 
 
@@ -121,15 +122,21 @@ def _counts(note: _Note) -> bool:
 
 def _read(path: Path) -> _Note | None:
     """None where it is no note, not one of ours, or not yet written: its stop has not asked for the lock then."""
-    with contextlib.suppress(OSError, ValueError):
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with contextlib.suppress(ValueError):
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):  # it may be one
+                raise
+            return None
         try:
             about = os.fstat(fd)
             ours = stat.S_ISREG(about.st_mode) and about.st_uid in (os.geteuid(), 0)
-            # a file that others may write to, or have linked to this name, is no one's
-            if ours and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and about.st_nlink == 1:
-                time_ns, began_ns, *by = os.read(fd, _LONGEST).decode("ascii").split()
-                return _Note(int(time_ns), int(began_ns), frozenset(by))
+            # what others may write to is no one's; what they have linked to this name has another one inside
+            if ours and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                lock, time_ns, began_ns, *by = os.read(fd, _LONGEST).decode("ascii").split()
+                if path.name.startswith(_prefix(lock)):
+                    return _Note(int(time_ns), int(began_ns), frozenset(by))
         finally:
             os.close(fd)
     return None
@@ -161,18 +168,23 @@ _first_ns = _started_ns(os.getpid())  # a process that is forked inherits what i
 
 
 def _began_ns() -> int:
-    """When this program began: with the process that has started this one to share its work, where there is one."""
-    began_ns = min(_first_ns, _started_ns(os.getpid()))
+    """When this program began: with the process that has started this one to share its work, where there is one.
+
+    A minute before itself at most: what is started later than that after a stop is asked for anew.
+    """
+    own_ns = _started_ns(os.getpid())
+    began_ns = min(_first_ns, own_ns)
     if (shared := sys.modules.get("multiprocessing.process")) is not None:
         parent = shared.parent_process()
         if parent is not None and (parents_ns := _started_ns(parent.pid)):
             began_ns = min(began_ns, parents_ns)
-    return began_ns
+    return max(began_ns, own_ns - round(SHARED_S * 1e9))
 
 
-def _ancestors(pid: int) -> Iterator[int]:
-    """The process and those that it descends from, without the first of all."""
+def _ancestors() -> Iterator[int]:
+    """This process and those that it descends from, as far as they are in its container."""
+    pid = os.getpid()
     with contextlib.suppress(OSError, ValueError, IndexError):
-        while pid > 1:
+        while pid > 0:
             yield pid
             pid = int(_status(pid)[1])

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 # --- Its drive, its plant and its faults, from the configuration ---
 
 
+_OF_EVERY_DRIVE = ((0x6040, "controlword"), (0x6041, "statusword"))  # mandatory in CiA 402
 VIRTUAL_EDS = SHIPPED_FOLDER / "virtual_joint.eds"  # what the virtual drive is, whatever objects it shows
 
 
@@ -139,6 +140,10 @@ def device_settings(config: Config) -> DeviceSettings:
     drive = canopen_section(config)
     path = eds_path(config)
     eds = None if path.resolve() == VIRTUAL_EDS else read_eds(path, drive.node)
+    missing = [f"{index:04X} ({name})" for index, name in _OF_EVERY_DRIVE if eds and index not in eds.dictionary]
+    if missing:
+        lacks = f"it has no {' and no '.join(missing)}"
+        raise ConfigurationError(f"drive.eds (={path}) is not that of a CiA 402 drive: {lacks}")
     vendor_id, product_code = (eds.vendor_id, eds.product_code) if eds is not None else (None, None)
     current_A, torque_Nm, constant_NmpA = drive.rated_current_A, drive.rated_torque_Nm, torque_constant_NmpA(config)
     if current_A is None and torque_Nm is None:  # `problems` refuses a file with [virtual] for that

@@ -39,6 +39,12 @@ def refuse_special(path: Path) -> None:
             raise DataError(f"{path}: is a device, a FIFO or a socket, and only files are written")
 
 
+def refuse_read_only(path: Path) -> None:
+    """`DataError` for a file whose mode protects it: in a folder of ours a new one could take its place."""
+    if path.exists() and not os.access(path, os.W_OK):
+        raise DataError(f"{path}: cannot be written: no permission")
+
+
 def require_target(path: Path, inputs: Iterable[Path] = ()) -> None:
     """As `refuse_overwriting` and `refuse_special`; `DataError` too if its folder is not there."""
     refuse_overwriting(path, inputs)
@@ -71,6 +77,7 @@ def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | Non
     """Write a new file beside `path`, let `check` read it, then put it in place in one step."""
     path = path.resolve()
     refuse_special(path)
+    refuse_read_only(path)
     with writing(path):
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     temporary = Path(name)

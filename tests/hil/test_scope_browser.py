@@ -56,6 +56,13 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
     # with a browser beside it the loop may stand still for milliseconds: that is not what these tests are about
     config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0, **changes)
     bench.joint(config)
+    scope, tab, url = page_of(bench, browser, config, *options)
+    state_is(tab, "ready; nothing moves")
+    return scope, tab, url
+
+
+def page_of(bench: Any, browser: Browser, config: str, *options: str) -> tuple[Any, Tab, str]:
+    """`jointctl scope CONFIG` and its page, whatever it shows."""
     port = free_port()
     scope = bench.start("scope", config, "--port", str(port), *options, env=environment()).saw("token=")
     url = printed_address(scope)
@@ -67,9 +74,7 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
         except OSError:
             assert time.monotonic() < give_up, scope.err
             time.sleep(0.2)
-    tab = browser.open(url)
-    state_is(tab, "ready; nothing moves")
-    return scope, tab, url
+    return scope, browser.open(url), url
 
 
 def printed_address(scope: Any) -> str:
@@ -170,6 +175,57 @@ def test_a_stop_that_does_not_arrive_is_told(bench: Any, browser: Browser) -> No
     os.kill(server, signal.SIGKILL)
     done = scope.finished(30.0)
     done.refused(done.code, "the scope's web server has ended")
+    assert bench.disabled()
+
+
+def panel(tab: Tab) -> str:
+    """What the panel with Start and Prepare shows."""
+    return str(tab.js("document.querySelector('[data-testid=\"start-panel\"]').innerText"))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, browser: Browser, moving: bool) -> None:
+    scope, tab, _ = opened(bench, browser)
+    if moving:
+        start(tab)
+        moves(tab)
+    stopped = bench.run("stop", "joint.toml")
+    assert (stopped.code, stopped.out) == (0, "the drive is switch on disabled\n"), stopped
+    assert scope.finished(20.0).code == 130
+    assert bench.disabled()
+    state_is(tab, "jointctl has ended")
+    assert "operation enabled" not in tab.text("state")
+    words = "stopped  by jointctl stop" if moving else "scope ended by jointctl stop; the drive is disabled"
+    assert words in panel(tab)
+    assert "Prepare" not in panel(tab)  # no one would take it
+    assert "Start" not in panel(tab)
+    time.sleep(4.0)
+    assert tab.js("document.querySelector('[data-testid=\"stale\"]').style.display") == "none"  # nothing may move
+
+
+def test_what_is_prepared_after_a_stop_is_a_new_run(bench: Any, browser: Browser) -> None:
+    config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("tracking")
+    scope, tab, _ = page_of(bench, browser, config)
+    tab.until("document.querySelector('[data-testid=\"start-panel\"]').innerText.includes('another program controls')")
+    assert bench.run("stop", config).code == 0
+    assert run.finished(20.0).code == 130
+    tab.click("prepare")  # within the first minute of the page's program
+    state_is(tab, "ready; nothing moves")
+    tab.click("stop")
+    state_is(tab, "not started; the drive is disabled")
+    assert bench.run("stop", config).code == 0  # the page controls nothing, and goes on
+    tab.click("prepare")
+    state_is(tab, "ready; nothing moves")
+    start(tab)
+    moves(tab)
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    assert bench.run("stop", config).code == 0  # after the press
+    scope.saw("scope ended by jointctl stop", 20.0)
+    assert scope.finished(20.0).code == 130
     assert bench.disabled()
 
 
@@ -287,6 +343,9 @@ def test_a_refused_set_point_is_told_at_its_field(bench: Any, browser: Browser) 
     assert tab.js(CONTRASTS) == ""
     tab.enter("set-point", "0.1")
     tab.until(f"!{field}.innerText.includes('must be in')")
+    tab.enter("set-point", "")
+    tab.click("go")
+    tab.until(f"{field}.innerText.includes('position_rad is empty: must be a number')")
 
 
 def test_stop_before_start_ends_the_preparation(bench: Any, browser: Browser) -> None:
@@ -315,6 +374,55 @@ def test_pause_zoom_and_trigger(bench: Any, browser: Browser) -> None:
     held = tab.js(LAST_s)
     time.sleep(1.0)
     assert tab.js(LAST_s) == held
+
+
+def is_on(tab: Tab, name: str) -> bool:
+    """Of a switch or a box."""
+    return bool(tab.js(f"document.querySelector('[data-testid=\"{name}\"]').getAttribute('aria-checked') === 'true'"))
+
+
+def test_what_is_chosen_between_two_runs_is_for_the_next_one(bench: Any, browser: Browser) -> None:
+    _, tab, _ = opened(bench, browser)
+    start(tab)
+    moves(tab)
+    time.sleep(9.0)  # through the angle's zero crossing, and half a span further
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    tab.click("trigger")
+    state_is(tab, "ready; nothing moves")
+    assert is_on(tab, "trigger")  # the crossing of the run before does not count
+    start(tab)
+    moves(tab)
+    tab.until("document.querySelector('[data-testid=\"pause\"]').getAttribute('aria-checked') === 'true'", 40.0)
+    assert not is_on(tab, "trigger")
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    tab.click("prepare")
+    state_is(tab, "ready; nothing moves")
+    start(tab)
+    moves(tab)  # what was held is gone
+    assert not is_on(tab, "pause")
+
+
+def test_no_choice_is_lost_to_a_page_that_answers_late(bench: Any, browser: Browser) -> None:
+    scope, tab, url = opened(bench, browser)
+    server = scope.child("jointctl.tools.scoping.server")
+    tab.js("document.querySelector('[data-testid=\"signals\"]').click(); null")
+    items = "[...document.querySelectorAll('.q-menu .q-item')]"
+    tab.until(f"{items}.length > 5")
+    os.kill(server, signal.SIGSTOP)
+    for name in ("velocity [rad/s]", "error [mrad]"):
+        tab.js(f"{items}.find(item => item.innerText === '{name}').click(); null")
+        time.sleep(0.2)
+    os.kill(server, signal.SIGCONT)
+    start(tab)
+    shown = f"{ZOOM}.getOption().series.map(one => one.name).join()"
+    tab.until(f"{shown} === 'desired angle [rad],angle [rad],command torque [Nm],velocity [rad/s],error [mrad]'")
+    new = browser.open(url)  # whose colours are asked for while it comes up
+    new.click("dark")
+    time.sleep(2.0)
+    assert new.js("document.body.classList.contains('body--dark')")
 
 
 def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) -> None:

@@ -312,7 +312,8 @@ def problem_line(
         tags = error["ctx"].get("expected_tags", _TRAJECTORIES)
         given = f" (={_shown(value.get('kind'))})" if kind == "union_tag_invalid" else ""
         return f"{name}.kind{given} must be one of {tags.removeprefix('one of ')}"
-    return f"{name} (={_shown(value)}) {_RULES.get(kind) or _rule(error)}"
+    given = "is empty:" if value is None else f"(={_shown(value)})"  # as a page's field; no file can say so
+    return f"{name} {given} {_RULES.get(kind) or _rule(error)}"
 
 
 _RULES = {

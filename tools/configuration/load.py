@@ -37,7 +37,7 @@ def shipped_config(name: str) -> Path:
 def _meant(path: Path) -> str:
     """The shipped configuration, or the file beside, whose name is spelt alike; "" if there is none."""
     shipped = {each.stem: each.stem for each in SHIPPED_FOLDER.glob("*.toml")} if path.parent == Path() else {}
-    beside = {each.name: str(each) for each in path.parent.glob("*.toml")}
+    beside = {each.name: str(each) for each in path.parent.glob("*.toml") if each.name != path.name}
     near = difflib.get_close_matches(path.name, [*shipped, *beside], n=1, cutoff=SPELT_ALIKE)
     return f"did you mean {({**shipped, **beside})[near[0]]}?" if near else ""
 
@@ -51,7 +51,8 @@ def read_text(path: Path) -> str:
     try:
         return read_input(path).decode("utf-8-sig")
     except FileNotFoundError:
-        raise ConfigurationError(f"{path}: no such file", _meant(path) or f"shipped configurations: {known}") from None
+        what = f"a link to {path.readlink()}, which is not there" if path.is_symlink() else "no such file"
+        raise ConfigurationError(f"{path}: {what}", _meant(path) or f"shipped configurations: {known}") from None
     except IsADirectoryError:
         raise ConfigurationError(f"{path}: is a folder, not a configuration file") from None
     except UnicodeDecodeError as error:
@@ -83,7 +84,11 @@ def load_config(path: str | Path) -> Config:
 
     What only the virtual joint can judge of [virtual] is judged where it is made (`tools.virtual_joint`).
     """
-    return config_of(Path(path), *read_document(Path(path)))
+    text, data = read_document(Path(path))
+    if isinstance(arm := data.get("arm"), dict):
+        joints = ", ".join(map(str, joints)) if isinstance(joints := arm.get("joints"), list) else "arm.joints"
+        raise ConfigurationError(f"{path}: is the file of an arm, not of a joint", f"name one of its joints: {joints}")
+    return config_of(Path(path), text, data)
 
 
 def read_document(path: Path) -> tuple[str, dict[str, Any]]:

@@ -30,9 +30,7 @@ from jointctl.tools.inspection.subject import SdoReader
 
 
 _SECTION = re.compile(r"\[(\w+)\]")
-_KEY = re.compile(
-    r"(?P<off># )?(?P<key>\w+)(?P<equals> = )(?P<value>\"[^\"]*\"|[^#\s]+)(?P<space>\s*)(?P<comment>#.*)?"
-)
+_KEY = re.compile(r"(?P<off># )?(?P<key>\w+)\s*=\s*(?P<value>\"[^\"]*\"|[^#\s]+)(?P<space>\s*)(?P<comment>#.*)?")
 _MARK = re.compile(r"# FILL IN(?P<optional> if[^:]*)?: ?(?P<text>.*)")
 _HEXADECIMAL = ("vendor_id", "product_code")
 Place = tuple[str, str]
@@ -72,18 +70,23 @@ def marks(text: str) -> list[Mark]:
     return found
 
 
-def filled(text: str, values: Mapping[Place, object]) -> str:
-    """The text with these values in the lines of their keys, which are no comments any more; other keys are left."""
+def filled(text: str, values: Mapping[Place, object], *, marked: bool = True) -> str:
+    """The text with these values in the lines of their keys, which are no comments any more; other keys are left.
+
+    `marked` False: comments are left as well.
+    """
     lines, section = [], ""
-    for line in text.splitlines(keepends=True):
+    for whole in text.splitlines(keepends=True):
+        line = whole
         if head := _SECTION.match(line):
             section = head[1]
         key = _KEY.match(line)
-        if key and (section, key["key"]) in values:
+        if key and (section, key["key"]) in values and (marked or not key["off"]):
             value = toml_text(values[section, key["key"]], key["key"])
             comment = re.sub(r"FILL IN(?: if[^:]*)?: ", "", key["comment"] or "").rstrip()
             line = f"{key['key']} = {value}"
-            line = f"{line:<33} {comment}".rstrip() + "\n" if comment else line + "\n"
+            line = f"{line:<33} {comment}".rstrip() if comment else line
+            line += "\r\n" if whole.endswith("\r\n") else "\n"
         lines.append(line)
     return "".join(lines)
 

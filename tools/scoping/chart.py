@@ -40,6 +40,8 @@ _ON_CLICK = """(function listen() {
     if (chart.containPixel('grid', at)) emitEvent('cursor-ID', chart.convertFromPixel({xAxisIndex: 0}, at[0]))
   })
 })()"""
+# a choice shows before the server has answered: the next one, made from what is shown, would take it back
+_SHOWN_AT_ONCE = """value => { mounted_app.elements[ID].props['model-value'] = value }"""
 _ZOOMED = "(zoom => [zoom.startValue, zoom.endValue])(getElement(ID).chart.getOption().dataZoom[0])"
 _SAVE_PNG = """(() => {
   const link = document.createElement('a')
@@ -71,7 +73,8 @@ class Chart:
     """Refreshed ten times a second; what is not live or is paused is drawn only when something about it changes."""
 
     def __init__(self, history: History, *, live: bool) -> None:
-        self._all, self._history = history, history
+        self._all, self._history, self._live = history, history, live
+        self._run = history.runs
         self._held_s: float | None = None  # right end of the picture while it stands
         self._drawn: Any = None
         self._names: tuple[str, list[str]] | None = None  # view and signals of the picture
@@ -85,6 +88,7 @@ class Chart:
                 self._joint.props('dense options-dense data-testid="joint"')
             self._signals = ui.select(list(SIGNALS), value=list(FIRST_SIGNALS), multiple=True, label="signals")
             self._signals.classes("grow min-w-40").props('dense options-dense data-testid="signals"')
+            self._signals.on("update:model-value", js_handler=_SHOWN_AT_ONCE.replace("ID", str(self._signals.id)))
             self._span = ui.select(list(SPANS_s), value=10 if live else 60, label="span [s]").classes("w-20")
             self._span.props("dense options-dense")
             self._pause = ui.switch("pause", on_change=self._on_pause).props('dense data-testid="pause"')
@@ -173,6 +177,10 @@ class Chart:
     def _file_name(self, ending: str) -> str:
         return f"jointctl-{self._view.value}.{ending}"
 
+    def resend_choice(self) -> None:
+        """What counts: of a page that was cut off, a choice may not have arrived."""
+        self._signals.update()
+
     def dark(self, on: bool) -> None:
         self._colours, text = (DARK_COLOURS, _DARK_TEXT) if on else (COLOURS, _TEXT)
         self._grid = {"lineStyle": {"width": 0.6, "color": _DARK_GRID if on else _GRID}}
@@ -198,12 +206,20 @@ class Chart:
     def _reset_zoom(self) -> None:
         self._chart.run_chart_method("dispatchAction", {"type": "dataZoom", "start": 0, "end": 100})
 
+    @property
+    def _between_runs(self) -> bool:
+        """Whether what is here is of a run that is over, and another one may follow."""
+        return self._live and self._all.settings.get("stage") != "running"
+
     def refresh(self) -> None:
+        if self._run != self._all.runs:  # the picture that was held is gone
+            self._run, self._held_s = self._all.runs, None
+            self._pause.value = False
         span_s = float(self._span.value)
         rows = self._history.newest(span_s, self._held_s)
         if not len(rows):
             return
-        if self._armed.value and not self._pause.value:
+        if self._armed.value and not self._pause.value and not self._between_runs:
             self._look_for_trigger(rows, span_s)
             rows = self._history.newest(span_s, self._held_s)
         names = list(self._signals.value or [])

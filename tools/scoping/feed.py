@@ -39,6 +39,7 @@ SERVER_SILENT = (
     f"no word from the scope's server for {SILENT_S:g} s: it counts as no page open; Ctrl-C or `jointctl stop` brakes"
 )
 SCOPE = "the scope"
+OVER = "over"  # the last stage: the program ends as it should, and nothing moves any more
 SERVER_ENDED = "{}'s server has ended: no page shows or stops the joint"
 
 
@@ -266,7 +267,11 @@ def scope_server(
     """The server process; it ends by itself a moment after this does.  For the rest see `ScopeFeed`."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with server_process("jointctl.tools.scoping.server", replace(order, feed_fd=theirs.fileno()), [theirs], [ours]):
-        yield ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
+        feed = ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
+        try:
+            yield feed
+        finally:
+            feed.settings({"stage": OVER})
 
 
 @contextmanager

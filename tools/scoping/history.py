@@ -67,6 +67,7 @@ class History:
         self._start_ns = 0
         self._lock = threading.Lock()
         self.skipped = 0
+        self.runs = 0  # that have begun
         self.events: deque[Event] = deque(maxlen=EVENTS)
         self.settings: dict[str, Any] = {}  # what the supervisor tells: gains, motion, stage, ...
         self.ended = False
@@ -101,6 +102,7 @@ class History:
         for other in self._others:
             other.begin()
         with self._lock:
+            self.runs += 1
             self._head = 0
             self._start_ns = 0
             self.skipped = 0

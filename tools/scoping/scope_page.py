@@ -11,9 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from nicegui import ui
 
+from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.scoping.chart import Chart
-from jointctl.tools.scoping.feed import ScopeOrder
+from jointctl.tools.scoping.feed import OVER, ScopeOrder
 from jointctl.tools.scoping.history import History, percentiles_us
 from jointctl.tools.session.display import ViewerRequest, fault_words, phase_name, viewer
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
@@ -65,7 +66,8 @@ document.addEventListener('keyup', event => {
     const beat = document.querySelector('[data-testid="beat"]'), stale = document.querySelector('[data-testid="stale"]')
     if (!beat || !stale) return
     if (beat.textContent !== seen) { seen = beat.textContent; at = Date.now() }
-    stale.style.display = Date.now() - at > STALE_MS ? 'block' : 'none'
+    const late = Date.now() - at > STALE_MS && !beat.textContent.endsWith('OVER')
+    stale.style.display = late ? 'block' : 'none'
   }, 500)
 })()
 </script>"""
@@ -91,9 +93,9 @@ class StopButton:
             word.style("max-width: 420px; text-align: right")
         self._beat: Any = ui.label("").style("display: none").props('data-testid="beat"')
 
-    def beat(self, number: int, *, moves: bool) -> None:
-        """A sign of life, at least once a second, and whether the joint is under control."""
-        self._beat.text = f"{number} MOVES" if moves else str(number)
+    def beat(self, number: int, word: str) -> None:
+        """A sign of life, at least once a second; `MOVES` while the joint is under control, `OVER`: the last one."""
+        self._beat.text = f"{number} {word}"
 
 
 def stale_mark() -> None:
@@ -104,6 +106,7 @@ def stale_mark() -> None:
 
 # --- before the joint moves ---
 
+ENDED = "jointctl has ended"
 Ask = Callable[[str, dict[str, Any]], None]
 
 
@@ -140,16 +143,17 @@ class StartPanel:
         """Follow the stage."""
         stage = settings.get("stage")
         ready = stage == "ready"
-        self._card.visible = ready or stage in ("ended", "declined")
+        over = stage == OVER and bool(settings.get("lines"))
+        self._card.visible = ready or over or stage in ("ended", "declined")
         number = settings.get("number")
         if ready and number != self._number:
             self._number = number
             self._clear.value = False
             self._start.enabled = False
-        self._title.text = "The joint is about to move:" if ready else "The run is over"
+        self._title.text = "The joint is about to move:" if ready else ENDED if over else "The run is over"
         self._lines.text = "\n".join(settings.get("lines", []))
         self._clear.visible = self._start.visible = ready
-        self._prepare.visible = not ready
+        self._prepare.visible = not (ready or over)
 
 
 # --- what may be changed while it moves: set-point, trajectory, gains; and the recording ---
@@ -394,8 +398,8 @@ class ScopePage:
         self._draw_again_s = 0.0
         client: Any = ui.context.client
         self._who = viewer(getattr(client, "ip", None))
-        self._dark = ui.dark_mode(False)
-        client.on_connect(self._follow_system)
+        self._dark, self._dark_chosen = ui.dark_mode(False), False
+        client.on_connect(self._on_connect)
         ui.colors(primary="#1f5fa8")
         ui.add_css(CSS)
         self._build()
@@ -427,12 +431,16 @@ class ScopePage:
                 self._changes = None
         self._dark_switch = ui.switch("dark", on_change=self._on_dark).props('dense data-testid="dark"')
 
-    async def _follow_system(self) -> None:
-        """Dark where the viewer's system is, until the switch is used."""
+    async def _on_connect(self) -> None:
+        """Or was cut off for a moment.  Dark where the viewer's system is, until the switch is used."""
+        self._chart.resend_choice()
         with contextlib.suppress(TimeoutError):
-            self._dark_switch.value = bool(await ui.run_javascript(_PREFERS_DARK))
+            prefers_dark = bool(await ui.run_javascript(_PREFERS_DARK))
+            if not self._dark_chosen:
+                self._dark_switch.value = prefers_dark
 
     def _on_dark(self) -> None:
+        self._dark_chosen = True
         self._dark.value = bool(self._dark_switch.value)
         self._chart.dark(self._dark.value)
 
@@ -455,7 +463,8 @@ class ScopePage:
         self._texts()
         if self._stop is not None:
             stage = self._history.settings.get("stage")
-            self._stop.beat(self._ticks, moves=stage == "running" and not self._history.ended)
+            moves = stage == "running" and not self._history.ended
+            self._stop.beat(self._ticks, "MOVES" if moves else "OVER" if stage == OVER else "")
         settings = self._history.settings
         if self._start is not None:
             self._start.show(settings)
@@ -469,6 +478,8 @@ class ScopePage:
         self._events.text = "\n".join(self._line(event) for event in reversed(events)) or "none yet"
         fault = int(rows[-1]["fault"]) if len(rows) else 0
         words = [STAGES[stage]] if stage in STAGES else self._words(rows, stage) if len(rows) else []
+        if stage == OVER:
+            words.append(ENDED)
         self._state.text = " · ".join(words) or "waiting for the run"
         silent_s = time.monotonic() - self._history.heard_s
         if stage == "running" and not self._history.ended and silent_s > SILENT_s:
@@ -486,14 +497,17 @@ class ScopePage:
     def _words(self, rows: np.ndarray, stage: str) -> list[str]:
         last = rows[-1]
         drive = drive_state_name(session_drive(self._order.drive), int(last["status_word"]), int(last["drive_state"]))
-        words = [phase_name(int(last["phase"])), f"drive: {drive}"]
+        ended = self._history.ended or stage in ("ended", OVER)
+        # where the last records have not come, they would show an enabled drive
+        known = not ended or int(last["phase"]) == AxisPhase.FINISHED or self._link is None
+        words = [phase_name(int(last["phase"])), f"drive: {drive}"] if known else []
         temperature_degC = self._history.settings.get("temperature_degC")
-        if temperature_degC is not None and not self._history.ended and stage != "ended":
+        if temperature_degC is not None and not ended:
             words.append(f"{temperature_degC:.1f} °C")
         fault = int(last["fault"])
         if fault:
             words.append(f"FAULT: {fault_words(fault)}")
-        if self._history.ended or stage == "ended":
+        if ended:
             words.append("the run has ended")
         elif motion := self._history.settings.get("motion"):
             words.append(str(motion))

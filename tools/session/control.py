@@ -221,7 +221,11 @@ def _locked(
             locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
             for remark in (remark for lock in locks for remark in lock.remarks):
                 output.warning(remark)
-            if any(lock.stopped for lock in locks):
+            for lock in locks:
+                lock.deliver()
+            if signals.commanded_ns or any(lock.stopped for lock in locks):
+                for lock in locks:
+                    lock.settle()
                 words = "; nothing moved"
                 signals.on_stop_command()
                 if signals.raising:

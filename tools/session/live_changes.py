@@ -78,8 +78,9 @@ def checked_gains(
         number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
         if not number or not low[name] <= value <= high[name]:
             shown = f"{value:g}" if isinstance(value, float) else str(value)[:40]
+            what = "is empty:" if value is None else f"(={shown})"
             raise ConfigurationError(
-                f"control.{name} (={shown}) must be in [{low[name]:g}..{high[name]:g}], from live.gain_factor"
+                f"control.{name} {what} must be in [{low[name]:g}..{high[name]:g}], from live.gain_factor"
             )
         after[name] = float(value)
     return after

@@ -92,13 +92,16 @@ def live_scope(
         runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)
         try:
             while not runs.one():
-                _wait_for_prepare(feed, runs.last_end)
-                asked_anew()
-            return runs.code
-        except KeyboardInterrupt as ended:
-            by = runs.ended_by or str(ended)  # which names a stop that came before the bus was taken
-            output.note(f"scope ended{by}; {words(runs.drive_state, interrupted=True)}")
-            return INTERRUPTED if by else runs.code
+                asked_anew(_wait_for_prepare(feed, runs.last_end))
+        except KeyboardInterrupt:
+            try:
+                ended = f"scope ended{runs.ended_by}; {words(runs.drive_state, interrupted=True)}"
+            except JointctlError as error:
+                runs.tell("ended", [error.message, error.hint])
+                raise
+            output.note(ended)
+            runs.tell("ended", [ended])
+        return runs.code
 
 
 class _Runs:
@@ -109,11 +112,12 @@ class _Runs:
         self._allow_low_margin = allow_low_margin
         self.code = 0  # exit code of the last one
         self.drive_state = ""  # after the last one
-        self.ended_by = ""  # in words, where `jointctl stop` has ended it
+        self.ended_by = ""  # in words, where `jointctl stop` has ended the program
         self._ended = False  # whether a signal or `jointctl stop` has ended the program as well
         self.last_end: dict[str, Any] = {}  # to the page, of how the last one ended
 
-    def _tell(self, stage: str, lines: list[str]) -> None:
+    def tell(self, stage: str, lines: list[str]) -> None:
+        """The pages, and again until the next run is prepared."""
         self.last_end = {"stage": stage, "lines": lines}
         self._feed.settings(self.last_end)
 
@@ -127,7 +131,7 @@ class _Runs:
 
         output, feed, config = self._output, self._feed, self._config
         feed.forget()
-        self._tell("preparing", [])
+        self.tell("preparing", [])
         terminal = run_display(output, self._title)
         try:
             plan = resolve(config, allow_low_margin=self._allow_low_margin)
@@ -136,33 +140,35 @@ class _Runs:
                 session = Session(plan, consent, output, control, lambda _: Displays([terminal(), feed]))
                 try:
                     result = session.run()
-                except KeyboardInterrupt:
-                    if control.signals.commanded_ns:
-                        self.code = INTERRUPTED
-                    self.ended_by = control.signals.by_command
-                    raise
                 finally:
                     self.drive_state, self._ended = session.drive_state, control.signals.count > 0
             if result is None:
                 self.code = DECLINED
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
-                self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
+                self.tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
                 return False
             self.code = report_run(result, output, self._config)
         except ServerGone:
             raise
+        except KeyboardInterrupt as stop:
+            self.ended_by = str(stop)
+            if self.ended_by:
+                self.code = INTERRUPTED
+            raise
         except JointctlError as error:
             output.error(error.message, error.hint)
             self.code = error.exit_code
-            self._tell("ended", [error.message, error.hint])
+            self.tell("ended", [error.message, error.hint])
             return self._ended
         lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
         if result.summary.error is not None:
             lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
+        if result.stopped_by:
+            lines.insert(0, f"stopped  by {result.stopped_by}")
         if result.fault_text is not None:
             text = result.fault_text
             lines.insert(0, f"{result.fault.name}: {text.happened}; {text.advice}")
-        self._tell("ended", lines)
+        self.tell("ended", lines)
         return self._ended
 
 
@@ -208,10 +214,19 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
     return False
 
 
-def _wait_for_prepare(feed: ScopeFeed, last_end: dict[str, Any]) -> None:
-    """Until a viewer asks for the next run.  How the last one ended is said again: a full socket may drop it."""
-    told_s = time.monotonic()
-    while not any(request.kind == "prepare" for request in feed.requests()):
+def _wait_for_prepare(feed: ScopeFeed, last_end: dict[str, Any]) -> int:
+    """Until a viewer asks for the next run; CLOCK_BOOTTIME [ns] just before: a stop that came later is one of that run.
+
+    How the last one ended is said again: a full socket may drop it.
+    """
+    from jointctl.drivers.stop_note import now_ns
+
+    told_s, before_ns = time.monotonic(), now_ns()
+    while True:
+        looked_ns = now_ns()
+        if any(request.kind == "prepare" for request in feed.requests()):
+            return before_ns
+        before_ns = looked_ns
         _require_server(feed)
         if time.monotonic() - told_s > TELL_AGAIN_S:
             told_s = time.monotonic()

@@ -20,7 +20,7 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     """Stop and disable the drive now, or all those of an arm, also while another program controls them."""
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
-    from jointctl.drivers.bus_lock import StopCall
+    from jointctl.drivers.bus_lock import StopCall, end_programs
     from jointctl.drivers.drive import common_state
     from jointctl.tools.verbs.bench_drive import stop_targets
 
@@ -39,12 +39,11 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     with ExitStack() as stack:
         calls = [stack.enter_context(StopCall(*on)) for on in dict.fromkeys(target.place for target in targets)]
         switch_off()
-        for call in calls:
-            call.end(output.note, switch_off)
+        from jointctl.tools.session.result import require_off  # takes its time to load: before the last look
+
+        end_programs(calls, output.note, switch_off)
     if failures:
         raise failures[0]
-    from jointctl.tools.session.result import require_off  # takes its time to load
-
     state = common_state([f"drive {number}" for number in range(1, len(states) + 1)], states)
     which = "the drive is" if len(states) == 1 else f"all {len(states)} drives:"
     try:

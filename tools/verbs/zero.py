@@ -6,9 +6,13 @@ homing is disturbed, and the old value is in the file's history.
 
 from __future__ import annotations
 
+import codecs
 import math
 import time
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -50,16 +54,15 @@ def zero(
 ) -> int:
     """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
-    from jointctl.tools.configuration.load import load_config, read_text
-    from jointctl.tools.inspection.first_values import filled
     from jointctl.tools.session.plan import agreed, require_terminal
-    from jointctl.tools.written_file import replace_file
+    from jointctl.tools.written_file import refuse_read_only, replace_file
 
     if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
         raise ConfigurationError(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
+    refuse_read_only(config.path)
     if not -math.tau * 100.0 <= angle_rad <= math.tau * 100.0:
         raise ConfigurationError(f"--angle (={angle_rad:g}) must be in [-628..628] rad")
     if not assume_yes:
@@ -79,19 +82,42 @@ def zero(
         "angle_before_rad": found[0].angle_rad, "angle_after_rad": angle_rad,
         "zero_counts": {each.section: {"before": each.before, "after": each.after} for each in found},
     }  # fmt: skip
-    if not (assume_yes or agreed(output, f"Write {config.path}?")):
-        output.note("nothing was changed")
-        return DECLINED
-    text = filled(read_text(config.path), {(each.section, "zero_counts"): each.after for each in found})
-
-    def loads(path: object) -> None:
-        written = load_config(str(path))
-        if written.encoder.zero_counts != found[0].after:
-            raise ConfigurationError(f"{config.path}: encoder.zero_counts is written in a way that is not understood")
-
-    replace_file(config.path, text.encode(), loads)
+    if not limits.position_min_rad <= angle_rad <= limits.position_max_rad:
+        output.warning(
+            f"at {angle_rad:+.4f} rad the joint is outside of limits.position_*_rad, and will not be enabled"
+        )
+    _with_zeros(config.path, found)  # what cannot be done is refused before the question
+    if not assume_yes:
+        if not agreed(output, f"Write {config.path}?"):
+            output.note("nothing was changed")
+            return DECLINED
+        _require_still(config, _readings(config, angle_rad), [each.counts for each in found])
+    replace_file(config.path, _with_zeros(config.path, found))  # of the file as it is by now
     output.result(f"{config.path}: the joint is at {angle_rad:+.4f} rad here", data)
     return 0
+
+
+def _with_zeros(path: Path, found: Sequence[Zero]) -> bytes:
+    """The file with the new zeros, and everything else as it is; `ConfigurationError` where that cannot be."""
+    from jointctl.firmware_py.input_file import parse_toml
+    from jointctl.tools.configuration.load import config_of, read_document
+    from jointctl.tools.inspection.first_values import filled
+
+    text, wanted = read_document(path)
+    for each in found:
+        wanted[each.section]["zero_counts"] = each.after
+    text = filled(text, {(each.section, "zero_counts"): each.after for each in found}, marked=False)
+    try:
+        as_wanted = parse_toml(text) == wanted
+    except tomllib.TOMLDecodeError:
+        as_wanted = False
+    if not as_wanted:
+        places = " and ".join(f"`zero_counts = {each.before}` below [{each.section}]" for each in found)
+        raise ConfigurationError(
+            f"{path}: zero_counts is written in a way that is not understood", f"write it as {places}, and try again"
+        )
+    config_of(path, text, wanted)  # as it will be read: the number may be too large
+    return (codecs.BOM_UTF8 if path.read_bytes().startswith(codecs.BOM_UTF8) else b"") + text.encode()
 
 
 def _readings(config: Config, angle_rad: float) -> list[Zero]:
@@ -118,16 +144,22 @@ def _readings(config: Config, angle_rad: float) -> list[Zero]:
         first = [_counts(readers[number], *place) for _, number, place, _, _ in places]
         time.sleep(_APART_S)
         counts = [_counts(readers[number], *place) for _, number, place, _, _ in places]
-    for (section, *_, scale), before, after in zip(places, first, counts, strict=True):
-        travel = max(abs(after - before) - _NOISE_COUNTS, 0) * abs(scale)
-        if travel > config.limits.standstill_radps * _APART_S:
-            raise DeviceError(
-                f"the joint moves: [{section}] went from {before} to {after} in {_APART_S:g} s", "hold it"
-            )
-    return [
+    found = [
         Zero(section, now, was, round(now - angle_rad / scale), scale)
         for (section, _, _, was, scale), now in zip(places, counts, strict=True)
     ]
+    _require_still(config, found, first, f" in {_APART_S:g} s")
+    return found
+
+
+def _require_still(config: Config, found: Sequence[Zero], before: Sequence[int], within: str = "") -> None:
+    """`DeviceError` where an encoder has other counts than `before`, by more than its noise."""
+    for each, counts in zip(found, before, strict=True):
+        travel = max(abs(each.counts - counts) - _NOISE_COUNTS, 0) * abs(each.rad_per_count)
+        if travel > config.limits.standstill_radps * _APART_S:
+            raise DeviceError(
+                f"the joint moves: [{each.section}] went from {counts} to {each.counts}{within}", "hold it"
+            )
 
 
 def _counts(reader: SdoReader, index: int, sub: int) -> int:

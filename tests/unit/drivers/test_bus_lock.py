@@ -25,6 +25,7 @@ from jointctl.drivers.bus_lock import (
     BusLock,
     Holder,
     StopCall,
+    end_programs,
     is_marked,
     lock_holders,
     lock_name,
@@ -191,7 +192,7 @@ def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
     ended: list[bool] = []
     with controller(channel) as process:
         with StopCall("socketcan", channel) as call:
-            call.end(notes.append, lambda: ended.append(True))
+            end_programs([call], notes.append, lambda: ended.append(True))
         assert ended
         assert process.stdout is not None
         assert process.stdout.read() == "stopped\n"
@@ -210,7 +211,7 @@ def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | N
         if number is not None:
             process.send_signal(number)
         with StopCall("socketcan", channel) as call:
-            call.end(notes.append, lambda: ended.append(True))
+            end_programs([call], notes.append, lambda: ended.append(True))
         assert ended
         assert process.wait(5.0) == -signal.SIGKILL
     assert f"ending process {process.pid}" in notes[-1]

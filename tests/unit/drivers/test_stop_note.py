@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import shutil
@@ -11,14 +12,27 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from jointctl.drivers import bus_lock, stop_note
-from jointctl.drivers.bus_lock import BusLock, StopCall, lock_name
-from jointctl.drivers.stop_note import KEPT_S, MOST, asked, asked_anew, now_ns, remove_old, settle, stopped, write_note
+from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name
+from jointctl.drivers.stop_note import (
+    KEPT_S,
+    MOST,
+    SHARED_S,
+    asked,
+    asked_anew,
+    now_ns,
+    remove_old,
+    settle,
+    stopped,
+    write_note,
+)
 
 LOCK = "jointctl-bus-tested"
 EVERYONES = Path("/dev/shm")
@@ -44,7 +58,7 @@ def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stops of this process are another's."""
-    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))
 
 
 def started(monkeypatch: pytest.MonkeyPatch, ago_s: float) -> None:
@@ -70,8 +84,8 @@ def test_who_was_started_before_the_stop_and_has_its_bus_later_is_stopped(
         subprocess.run(
             [
                 sys.executable, "-c",
-                "import sys; from jointctl.drivers.bus_lock import StopCall\n"
-                "with StopCall('socketcan', sys.argv[1]) as call: call.end(print)", channel,
+                "import sys; from jointctl.drivers.bus_lock import StopCall, end_programs\n"
+                "with StopCall('socketcan', sys.argv[1]) as call: end_programs([call], print)", channel,
             ],
             check=True,
         )  # fmt: skip
@@ -117,13 +131,13 @@ def test_a_stop_counts_for_who_runs_when_it_comes(monkeypatch: pytest.MonkeyPatc
 def test_it_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that begins one joint after the other: a stop between two of them is one of the next."""
     started(monkeypatch, 100.0)
-    write_note(LOCK)
-    write_note(LOCK)
-    assert [stopped(LOCK), stopped(LOCK)] == [True, False]
-    write_note(LOCK)
-    asked(now_ns())  # a later stop of its own takes back nothing
-    write_note(LOCK)
-    assert [stopped(LOCK), stopped(LOCK)] == [True, False]
+    for _ in range(2):
+        write_note(LOCK)
+        asked(now_ns())  # a later stop of its own takes back nothing
+        write_note(LOCK)
+        assert [stopped(LOCK), stopped(LOCK)] == [True, True]  # it was not told yet
+        settle(LOCK)
+        assert not stopped(LOCK)
 
 
 @pytest.mark.usefixtures("others")
@@ -132,9 +146,18 @@ def test_one_that_has_reached_the_holder_of_the_lock_is_known_to_it() -> None:
     settle(LOCK)
     assert not stopped(LOCK)
     channel, reached = f"stop-note-holder-{os.getpid()}", threading.Event()
-    with BusLock("socketcan", channel, reached.set) as lock, StopCall("socketcan", channel):
-        assert reached.wait(5.0)
-    with BusLock("socketcan", channel, reached.set) as lock:
+    for delivers in (False, True):  # before it does, the program may yet leave with another error
+        with BusLock("socketcan", channel, reached.set) as lock:
+            assert not lock.stopped
+            if delivers:
+                lock.deliver()
+            with StopCall("socketcan", channel):
+                assert reached.wait(5.0)
+        with BusLock("socketcan", channel) as lock:
+            assert lock.stopped is not delivers
+            lock.settle()
+        reached.clear()
+    with BusLock("socketcan", channel) as lock:
         assert not lock.stopped
         write_note(lock._name)
     with BusLock("socketcan", channel) as lock:
@@ -158,9 +181,9 @@ def test_what_was_before_a_users_new_request_is_over(monkeypatch: pytest.MonkeyP
     """On the page: "Prepare"."""
     started(monkeypatch, 3600.0)
     write_note(LOCK)
-    asked_anew()
+    asked_anew(now_ns())
     assert not stopped(LOCK)
-    asked_anew()
+    asked_anew(now_ns())
     write_note(LOCK)  # while it is prepared
     assert stopped(LOCK)
 
@@ -187,6 +210,9 @@ def test_the_process_that_shares_its_work_is_asked_for_its_date(
     monkeypatch.setattr(stop_note, "_first_ns", later_ns)
     monkeypatch.setattr(stop_note, "_started_ns", lambda pid: {10: later_ns - 10**9, 11: 0}.get(pid, later_ns))
     assert stopped(LOCK) is found
+    much_later_ns = later_ns + round(SHARED_S * 1e9)  # a worker for each job, of a parent that lives for weeks
+    monkeypatch.setattr(stop_note, "_started_ns", lambda pid: later_ns - 10**9 if pid == 10 else much_later_ns)
+    assert not stopped(LOCK)
 
 
 def stopped_in(notes: Path) -> bool:
@@ -228,17 +254,16 @@ def test_a_process_is_dated_by_the_clock_of_the_notes() -> None:
 
 
 def test_where_no_one_knows_when_it_began_each_stop_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))
     monkeypatch.setattr(stop_note, "_status", lambda _: [])
     write_note(LOCK)
     assert stopped(LOCK)
 
 
-def test_a_stop_comes_from_its_process_and_those_above_but_not_from_everyones() -> None:
-    from_here = list(stop_note._ancestors(os.getpid()))
+def test_a_stop_comes_from_its_process_and_all_above() -> None:
+    from_here = list(stop_note._ancestors())
     assert from_here[:2] == [os.getpid(), os.getppid()]
-    assert 1 not in from_here
-    assert list(stop_note._ancestors(2**22 + 1)) == [2**22 + 1]  # the kernel has no such process
+    assert from_here[-1] == 1  # which is a container's program itself
 
 
 def test_another_process_of_the_same_number_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +287,7 @@ def test_garbage_is_no_note(notes: Path, content: bytes) -> None:
 
 
 @pytest.mark.usefixtures("others")
-@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's", "root's", "open", "linked"])
+@pytest.mark.parametrize("kind", ["link", "fifo", "folder", "another's", "root's", "open", "linked", "of another lock"])
 def test_what_is_neither_ours_nor_roots_is_no_note(notes: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     write_note(LOCK)
     (path,) = notes.iterdir()
@@ -276,12 +301,13 @@ def test_what_is_neither_ours_nor_roots_is_no_note(notes: Path, monkeypatch: pyt
         made: dict[str, Callable[[], object]] = {
             "link": lambda: path.symlink_to(content), "fifo": lambda: os.mkfifo(path), "folder": path.mkdir,
             "linked": lambda: path.hardlink_to(content),
+            "of another lock": lambda: path.write_text(f"{LOCK}2 {now_ns()} 0"),
             "open": lambda: (shutil.copy(content, path), path.chmod(0o666)),
         }  # fmt: skip
         made[kind]()
     files = len(os.listdir("/proc/self/fd"))
     stop_note._settled_ns.clear()
-    assert stopped(LOCK) is (kind == "root's")
+    assert stopped(LOCK) is (kind in ("root's", "linked"))
     remove_old(LOCK)
     assert len(os.listdir("/proc/self/fd")) == files
 
@@ -311,7 +337,7 @@ def test_a_note_that_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(stop_note, "FOLDER", tmp_path / "none")
     told: list[str] = []
     with StopCall("socketcan", "tested-no-note") as call:
-        call.end(told.append)
+        end_programs([call], told.append)
     assert len(told) == 1
     assert "just starting" in told[0]
     assert "No such file" in told[0]
@@ -334,7 +360,7 @@ def test_the_lock_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
         with BusLock("socketcan", channel) as lock:
             assert lock.stopped is expected
         with StopCall("socketcan", channel) as call:
-            call.end(pytest.fail)
+            end_programs([call], pytest.fail)
     monkeypatch.setattr(bus_lock.sys, "platform", "darwin")  # no locks, and no notes
     with BusLock("socketcan", channel) as lock, StopCall("socketcan", channel):
         assert not lock.stopped
@@ -350,10 +376,54 @@ def test_a_stop_notes_when_it_begins_and_when_it_ends_and_clears_away(
     now += round(KEPT_S * 1e9) + 1
     with StopCall("socketcan", "tested-two-notes") as call:
         written = {now}
-        assert [int(path.read_bytes().split()[0]) for path in notes.glob(f"{call._name}*")] == [now]
+        assert [int(path.read_bytes().split()[1]) for path in notes.glob(f"{call._name}*")] == [now]
         now += 1000  # a program has been started since
-        call.end(pytest.fail)
-    assert {int(path.read_bytes().split()[0]) for path in notes.iterdir()} == {*written, now}
+        end_programs([call], pytest.fail)
+    assert {int(path.read_bytes().split()[1]) for path in notes.iterdir()} == {*written, now}
     with StopCall("virtual", "x") as call:  # python-can's own: no one else can be on it
-        call.end(pytest.fail)
+        end_programs([call], pytest.fail)
     assert len(list(notes.iterdir())) == 2
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOENT, errno.EACCES])
+def test_a_note_that_may_be_there_is_not_overlooked(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    def fail(*_: Any) -> int:
+        raise OSError(number, "cannot be opened")
+
+    write_note(LOCK)
+    monkeypatch.setattr(stop_note, "os", SimpleNamespace(**{**vars(os), "open": fail}))
+    hides = number in (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+    with pytest.raises(OSError, match="cannot be opened") if hides else nullcontext():
+        assert not stopped(LOCK)
+
+
+@pytest.mark.usefixtures("others")
+def test_where_no_lock_can_be_had_the_notes_count_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_socket(*_: Any) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(bus_lock, "listener", no_socket)
+    for expected in (False, True):
+        with BusLock("socketcan", "tested-no-socket") as lock:
+            assert lock.stopped is expected
+        write_note(lock_name("socketcan", "tested-no-socket"))
+
+
+@pytest.mark.usefixtures("others")
+def test_a_stop_looks_at_all_its_buses_until_no_one_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While one bus's program brakes, another one may take the bus that was free."""
+    found = {"a": [True, False, False], "b": [False, True, False]}
+    looks: list[str] = []
+
+    class Call(StopCall):
+        def __init__(self, name: str) -> None:
+            super().__init__("socketcan", f"tested-looks-{name}")
+            self.name = name
+
+        def _end_controllers(self, note: Any, ended: Any) -> bool:
+            looks.append(self.name)
+            return found[self.name].pop(0)
+
+    with Call("a") as a, Call("b") as b:
+        end_programs([a, b], pytest.fail)
+    assert looks == ["a", "b"] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ def old_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("FOLDER", tmp_path), ("_asked_ns", None), ("_settled_ns", {})):
         monkeypatch.setattr(stop_note, name, value)
     monkeypatch.setattr(stop_note, "_began_ns", lambda: now_ns() - 3600 * 10**9)
-    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def test_it_counts_wherever_the_program_is(joint_file: Path) -> None:
 def test_a_stop_of_its_own_is_one_of_what_it_has_asked_for_before(
     joint_file: Path, monkeypatch: pytest.MonkeyPatch, before: bool
 ) -> None:
-    monkeypatch.setattr(stop_note, "_ancestors", lambda pid: iter((pid,)))
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter((os.getpid(),)))
     joint = None if before else Joint(joint_file)
     stop(joint_file)
     with pytest.raises(AssertionError if before else MotionFault):

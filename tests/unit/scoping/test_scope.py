@@ -21,7 +21,8 @@ import pytest
 from jointctl.drivers import stop_note
 from jointctl.drivers.bus_lock import lock_name
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, DataError, MotionFault, UsageError
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, ConfigurationError, DataError, MotionFault, UsageError
+from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
@@ -37,7 +38,7 @@ from jointctl.tools.scoping.server import COOKIE, allowed, cookie_name
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest, time_left
-from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, new_motion
+from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, checked_gains, new_motion
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.session.session import Session
@@ -637,6 +638,19 @@ def test_a_motion_without_an_end_says_so(
     assert (time_left(1e4, shown[0].duration_s, AxisPhase.TRACKING) == "until stopped") is not ends
 
 
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(None, "trajectory.position_rad is empty: must be a number"),
+     ("x", "trajectory.position_rad (=x) must be a number")],
+)  # fmt: skip
+def test_an_empty_field_is_refused_as_such(virtual_config: Any, value: object, words: str) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        new_motion(virtual_config, TABLE, {"kind": "hold", "duration_s": 0.0, "position_rad": value})
+    assert refused.value.message == words
+    with pytest.raises(ConfigurationError, match=r"^control.kp (is empty:|\(=x\)) must be in \[392..1568\]"):
+        checked_gains({"kp": value}, {"kp": 784.0}, {"kp": 392.0}, {"kp": 1568.0})
+
+
 # --- before Start, and after the end ---
 class Feed:
     """Presses Start as soon as it can, and asks for the next run when the end has been told three times."""
@@ -658,7 +672,12 @@ class Feed:
         last = self.told[-1]
         if last["stage"] == "ready":
             return [ViewerRequest("start", "a viewer", {"number": last["number"], "clear": True})]
-        return [ViewerRequest("prepare", "a viewer", {})] if self.told.count(last) >= 3 else []
+        if self.told.count(last) < 3:
+            return []
+        self.pressed()
+        return [ViewerRequest("prepare", "a viewer", {})]
+
+    def pressed(self) -> None: ...
 
 
 @pytest.mark.parametrize("refused", [True, False])
@@ -697,8 +716,11 @@ def test_the_end_of_a_run_is_told_until_the_next_is_prepared(monkeypatch: pytest
     feed: Any = Feed()
     ended = {"stage": "ended", "lines": ["log"]}
     feed.settings(ended)
-    scope_module._wait_for_prepare(feed, ended)
+    before_ns, pressed_ns = now_ns(), []
+    monkeypatch.setattr(feed, "pressed", lambda: pressed_ns.append(now_ns()))
+    asked_ns = scope_module._wait_for_prepare(feed, ended)
     assert feed.told == [ended] * 3
+    assert before_ns < asked_ns < pressed_ns[0]  # a stop that comes right after the press is later
 
 
 @pytest.mark.parametrize("when", ["before it", "between two runs"])
@@ -707,7 +729,7 @@ def test_a_stop_before_the_page_has_the_bus_ends_it_and_one_before_prepare_is_ov
 ) -> None:
     for name, value in (("FOLDER", tmp_path), ("_anew_ns", 0), ("_settled_ns", {})):
         monkeypatch.setattr(stop_note, name, value)
-    monkeypatch.setattr(stop_note, "_ancestors", lambda _: iter(()))  # the stops are another's
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))  # the stops are another's
     lock, runs = lock_name(virtual_config.bus.interface, virtual_config.bus.channel), []
 
     class Runs(Session):
@@ -723,7 +745,7 @@ def test_a_stop_before_the_page_has_the_bus_ends_it_and_one_before_prepare_is_ov
     monkeypatch.setattr("jointctl.tools.session.session.Session", Runs)
     monkeypatch.setattr("jointctl.tools.scoping.feed.scope_server", server)
     monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
-    monkeypatch.setattr(scope_module, "_wait_for_prepare", lambda *_: stop_note.write_note(lock))
+    monkeypatch.setattr(scope_module, "_wait_for_prepare", lambda *_: (stop_note.write_note(lock), now_ns())[1])
     if when == "before it":
         stop_note.write_note(lock)
     err = io.StringIO()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers import bus_lock
-from jointctl.drivers.bus_lock import BusLock, StopCall, lock_name, wait_for_answers
+from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name, wait_for_answers
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
@@ -287,7 +287,7 @@ class Computer:
     def stopped(self) -> bool:
         """Whether a controller has ended."""
         with StopCall("socketcan", "x") as call:
-            call.end(self.notes.append, lambda: self.ended_s.append(self.now_s))
+            end_programs([call], self.notes.append, lambda: self.ended_s.append(self.now_s))
         return bool(self.ended_s)
 
 
@@ -356,7 +356,7 @@ def test_one_that_has_the_lock_only_when_all_is_over_is_ended_as_well(monkeypatc
     computer = Computer(monkeypatch, [], [later])
     assert computer.stopped()
     assert later.log == ["stop", "closed"]
-    assert computer.awaited == [[], [later]]
+    assert computer.awaited == [[], [later], []]
     assert computer.ended_s == [pytest.approx(1.5, abs=0.03)]
 
 

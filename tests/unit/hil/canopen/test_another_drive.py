@@ -12,7 +12,7 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.tools.configuration.canopen import canopen_settings
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs.hil import with_eds
 from jointctl.tools.virtual_joint import new_device
@@ -199,6 +199,10 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         with_eds(shipped(), tmp_path / "none.eds")
     with pytest.raises(ConfigurationError, match="describes no object"):
         new_device(config_of(tmp_path, "nothing\n"))
+    encoder = (SHIPPED_FOLDER / "joint_encoder.eds").read_text()
+    words = r"maker.eds\) is not that of a CiA 402 drive: it has no 6040 \(controlword\) and no 6041"
+    with pytest.raises(ConfigurationError, match=words):
+        new_device(config_of(tmp_path, encoder))
     with pytest.raises(ConfigurationError, match=r"drive\.kind"):
         with_eds(shipped("elmo_serial"), tmp_path / "maker.eds")
 
