@@ -14,9 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.recording.run_log import RunLogWriter
 from tests.browser import PROGRAM, Browser, Tab, free_port
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
@@ -458,7 +462,7 @@ def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) 
     assert len(rows) > 800  # every sample, not the drawn ones
     assert downloaded(folder / "jointctl-time.png").startswith(b"\x89PNG")
 
-    for view, axis in (("x-y", "desired angle [rad]"), ("spectrum", "frequency [Hz]"), ("time", "s")):
+    for view, axis in (("x-y", "desired angle [rad]"), ("spectrum", "frequency [Hz]"), ("time", "time [s]")):
         buttons = "[...document.querySelectorAll('[data-testid=\"view\"] button')]"
         tab.js(f"{buttons}.find(b => b.innerText === '{view}').click(); null")
         tab.until(f"{ZOOM}.getOption().xAxis[0].name === '{axis}'")
@@ -466,6 +470,28 @@ def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) 
     tab.click("stop")
     state_is(tab, "the run has ended")
     assert bench.disabled()
+
+
+def test_each_stretch_of_a_long_log_can_be_seen_and_its_axes_are_named(bench: Any, browser: Browser) -> None:
+    log = bench.folder / "long.mcap"
+    records = new(LogRecord, 100_000)
+    records.time_ns = 1 + np.arange(100_000) * 1_000_000
+    records.phase = AxisPhase.TRACKING
+    records.position_rad = 0.001 * np.arange(100_000)
+    with RunLogWriter(log, {}) as writer:
+        writer.write_records(records.view(np.recarray))
+    _, tab, _ = page_of(bench, browser, str(log))
+    tab.until(f"{LAST_s} > 99.9")
+    tab.enter("until", "30")
+    tab.until(f"Math.abs({LAST_s} - 30) < 0.01")
+    buttons = "[...document.querySelectorAll('[data-testid=\"view\"] button')]"
+    tab.js(f"{buttons}.find(b => b.innerText === 'spectrum').click(); null")
+    tab.until(f"{ZOOM}.getOption().xAxis[0].name === 'frequency [Hz]'")
+    # nothing draws it again, as it does while a joint runs
+    tab.until(f"typeof {ZOOM}.getOption().yAxis[0].axisLabel.formatter === 'function'")
+    tab.call("Emulation.setDeviceMetricsOverride", width=400, height=900, deviceScaleFactor=1, mobile=False)
+    tab.until(f"{ZOOM}.getOption().legend[0].type === 'scroll'")
+    assert tab.js("document.documentElement.scrollWidth") <= 400
 
 
 def downloaded(path: Path) -> bytes:

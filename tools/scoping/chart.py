@@ -24,6 +24,7 @@ from jointctl.tools.scoping.history import (
 
 SPANS_s = (2, 5, 10, 30, 60)
 FIRST_SIGNALS = ("desired angle [rad]", "angle [rad]", "command torque [Nm]")
+NARROW_px = 600  # in rows, the names of the lines would cover the units of a picture that is no wider
 AFTER_TRIGGER = 0.5  # share of the span that is shown after the trigger
 COLOURS = ("#1f5fa8", "#b85c0c", "#2e7d52", "#a8323e", "#6a51a3", "#5f6b76")  # on white
 DARK_COLOURS = ("#6fa8e8", "#f0a35e", "#6fce9b", "#ef8791", "#b7a3ea", "#b4bec8")  # on nearly black
@@ -43,6 +44,8 @@ _ON_CLICK = """(function listen() {
 # a choice shows before the server has answered: the next one, made from what is shown, would take it back
 _SHOWN_AT_ONCE = """value => { mounted_app.elements[ID].props['model-value'] = value }"""
 _ZOOMED = "(zoom => [zoom.startValue, zoom.endValue])(getElement(ID).chart.getOption().dataZoom[0])"
+# the options as the element has them: functions among them are none on the way there
+_ANEW = "(element => element?.chart?.setOption(element.options, true))(getElement(ID))"
 _SAVE_PNG = """(() => {
   const link = document.createElement('a')
   link.href = getElement(ID).chart.getDataURL({type: 'png', pixelRatio: 2, backgroundColor: 'BEHIND'})
@@ -91,6 +94,9 @@ class Chart:
             self._signals.on("update:model-value", js_handler=_SHOWN_AT_ONCE.replace("ID", str(self._signals.id)))
             self._span = ui.select(list(SPANS_s), value=10 if live else 60, label="span [s]").classes("w-20")
             self._span.props("dense options-dense")
+            if not live and (end_s := self._end_s()) > SPANS_s[-1]:  # what came before can be seen as well
+                self._until = ui.number("until [s]", value=end_s, step=5, format="%.6g").classes("w-24")
+                self._until.on_value_change(self._on_until).props('dense data-testid="until"')
             self._pause = ui.switch("pause", on_change=self._on_pause).props('dense data-testid="pause"')
             ui.button("reset zoom", on_click=self._reset_zoom, color=None).props("flat dense no-caps")
         with ui.row().classes("w-full items-center gap-3"):
@@ -187,9 +193,18 @@ class Chart:
         self._behind = _DARK_BEHIND if on else _BEHIND
         options, plain = self._chart.options, {"color": text}
         options["textStyle"], options["legend"]["textStyle"] = plain, plain
+        narrow = {"type": "scroll", "pageTextStyle": plain, "pageIconColor": text, **options["legend"]}
+        options["media"] = [{"query": {"maxWidth": NARROW_px}, "option": {"legend": narrow}}]
         options["xAxis"] |= {"nameTextStyle": plain, "axisLabel": {**options["xAxis"]["axisLabel"], **plain}}
         self._text, self._drawn = text, None
         self._chart.update()
+
+    def _end_s(self) -> float:
+        rows = self._history.newest(1.0)
+        return round(float(self._history.seconds(rows)[-1]), 3) if len(rows) else 0.0
+
+    def _on_until(self) -> None:
+        self._held_s = None if self._until.value is None else float(self._until.value)
 
     def _on_pause(self) -> None:
         rows = self._history.newest(1.0)
@@ -251,7 +266,7 @@ class Chart:
         self._seen, chosen, names = found, (view, names), list(series)
         units = list(dict.fromkeys(name[name.index("[") :] for name in names))
         options, plain = self._chart.options, {"color": self._text}
-        options["xAxis"] |= {"name": "s" if over_time else found.x_name, **x_ends(view, found)}
+        options["xAxis"] |= {"name": found.x_name, **x_ends(view, found)}
         log = {"type": "log", "min": None, "max": None} if view == SPECTRUM else None
         options["yAxis"] = [
             {**_AXIS, **(log or axis_ends(unit, series)), "name": unit, "position": "left" if i == 0 else "right",
@@ -274,7 +289,7 @@ class Chart:
         self._chart.update()
         if chosen != self._names:  # axes that are left over would stay otherwise; the zoom begins anew
             self._names = chosen
-            self._chart.run_chart_method("setOption", options, True)
+            ui.run_javascript(_ANEW.replace("ID", str(self._chart.id)))
 
 
 def axis_ends(unit: str, series: Mapping[str, Sequence[Sequence[float | None]]]) -> dict[str, float | None]:
@@ -302,7 +317,9 @@ def _options() -> dict[str, Any]:
         "legend": {"top": 0},
         "grid": {"left": 56, "right": 24, "top": 52, "bottom": 74},
         "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "value", "name": "s", "min": "dataMin", "max": "dataMax", "splitLine": {"show": False},
+        # beside its axis the name would take the width of a narrow picture
+        "xAxis": {"type": "value", "name": TIME_NAME, "min": "dataMin", "max": "dataMax", "splitLine": {"show": False},
+                  "nameLocation": "middle", "nameGap": 24,
                   "axisLine": {"onZero": False},
                   "axisLabel": {"showMinLabel": False, "showMaxLabel": False}},
         "yAxis": [dict(_AXIS)],
