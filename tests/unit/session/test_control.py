@@ -9,13 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from jointctl.drivers import bus_lock
+from jointctl.drivers import bus_lock, stop_note
 from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name, wait_for_answers
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.records import LogRecord
@@ -125,6 +126,49 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
             signal.raise_signal(signal.SIGTERM)
     assert times_s == [stop_within_s(virtual_config) if configured else 3.0]
     assert "a remark" in capsys.readouterr().err
+
+
+def test_a_stop_that_an_error_hides_is_not_lost(virtual_config: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm that tries again until its second bus is free: the stop of its first one has told it nothing yet."""
+    at = [f"hidden-{os.getpid()}-{k}" for k in range(2)]
+    buses = [virtual_config.bus.model_copy(update={"channel": channel}) for channel in at]
+    joints = [virtual_config.model_copy(update={"bus": bus}) for bus in buses]
+    names = [lock_name("jointctl", x) for x in at]
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))  # the stop is another's
+    monkeypatch.setattr(stop_note, "_settled_ns", {})
+    stop_note.write_note(names[0])
+
+    def tried() -> bool:
+        with in_control(joints[0], Output(), joints[1:]) as ours:
+            return not ours.signals.commanded_ns
+
+    with taken(at[1]), pytest.raises(BusError, match="another program controls"):
+        tried()
+    with pytest.raises(KeyboardInterrupt, match="by jointctl stop; nothing moved"):
+        tried()
+    assert tried()  # it was told
+    for name in names:
+        stop_note.write_note(name)
+    with pytest.raises(KeyboardInterrupt):
+        tried()
+    assert tried()
+
+
+@contextmanager
+def taken(channel: str) -> Iterator[None]:
+    """By another program."""
+    hold = (
+        "import sys; from jointctl.drivers.bus_lock import BusLock\n"
+        "with BusLock('jointctl', sys.argv[1]): print('mine', flush=True); input()\n"
+    )
+    command = [sys.executable, "-c", hold, channel]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout.readline() == "mine\n"
+        yield
+        process.stdin.write("\n")
+        process.stdin.flush()
 
 
 @pytest.mark.parametrize(("commanded_ns", "text"), [(1, " by jointctl stop"), (0, "")])
