@@ -173,12 +173,17 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
 def test_the_end_of_the_scope_tells_how_the_drive_is(
     monkeypatch: pytest.MonkeyPatch, capsys: Any, virtual_config: Any, state: str, said: str
 ) -> None:
+    shown: list[tuple[str, ...]] = []  # on the page
+
     class Runs:
         code, drive_state, told, ended_by = 0, state, {}, ""
 
         def __init__(self, *_: Any, **__: Any) -> None: ...
         def one(self) -> bool:
             raise KeyboardInterrupt
+
+        def tell(self, stage: str, lines: list[str]) -> None:
+            shown.append((stage, *lines))
 
     monkeypatch.setattr(scope_module, "_Runs", Runs)
     monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
@@ -187,6 +192,8 @@ def test_the_end_of_the_scope_tells_how_the_drive_is(
     told = capsys.readouterr().err
     assert said in told
     assert ("disabled" in told) is (state == "switch on disabled")
+    assert [stage for stage, *_ in shown] == ["ended"]
+    assert shown[0][1] in told
 
 
 def test_a_sweep_on_a_drive_that_does_not_tell_its_torque_is_refused() -> None:
