@@ -215,10 +215,7 @@ def require_same_joint(config: Config, carrier: Carrier, peak_Nm: float, fit: Jo
     """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
     task = response_task(config, ResponseOptions())
     peak_Nm = min(peak_Nm, task.largest_Nm)
-    try:
-        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
-    except DataError:  # a leg was lost
-        inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
     _refuse_another("the response", fit.inertia_kgm2, when, inertia)
     carrier.output.note(f"  the same joint: {inertia.value:.4g} kg m^2 {when}")
 
@@ -255,6 +252,13 @@ def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
 def _stage(
     task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    """Once more where legs were lost to a computer that stood still for a moment: a tune of minutes need not end."""
     motion = task.motion(peak_Nm, pairs)
-    carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
+    title = f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm"
+    carried = carrier.run(task.config, motion, title)
+    try:
+        return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
+    except DataError as error:
+        carrier.output.note(f"  {error.message}: once more")
+    carried = carrier.run(task.config, motion, title)
     return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
 from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.tuning import carry_out
 from jointctl.tools.tuning.carry_out import response_task
 from jointctl.tools.tuning.excitation import (
     ResponsePlan,
@@ -285,3 +289,30 @@ def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own() -> None
     weak = response_task(shipped("realistic"), ResponseOptions()).config  # the twin
     assert weak.control.kind == "computed_torque_observer"
     assert weak.control.kv == 20.0
+
+
+@pytest.mark.parametrize(("lost", "measured"), [(0, 1), (1, 2), (2, 2)])
+def test_a_stage_whose_legs_were_lost_is_measured_once_more(
+    monkeypatch: pytest.MonkeyPatch, lost: int, measured: int
+) -> None:
+    """A computer that stood still for a moment does not end a tune of minutes; one that always does, does."""
+    runs: list[str] = []
+    said: list[str] = []
+
+    def response_of(*_: Any) -> str:
+        if len(runs) <= lost:
+            raise DataError("legs that were measured (=3) must be at least 4")
+        return "response"
+
+    def run(_: Any, __: Any, title: str) -> Any:
+        runs.append(title)
+        return SimpleNamespace(records="records")
+
+    monkeypatch.setattr(carry_out, "response_of", response_of)
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=said.append))
+    task = response_task(shipped("precise"), ResponseOptions())
+    with pytest.raises(DataError, match="must be at least 4") if lost == 2 else nullcontext():
+        found, records, plan = carry_out._stage(task, carrier, 1.0, 2)
+        assert (found, records, len(plan.legs.starts)) == ("response", "records", 4)
+    assert len(runs) == measured
+    assert len(said) == min(lost, 1)
