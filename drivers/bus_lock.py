@@ -39,7 +39,7 @@ from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import program_name
-from jointctl.drivers.stop_note import remove_old, settle, stopped, write_note
+from jointctl.drivers.stop_note import LOCKS, remove_old, settle, stopped, write_note
 
 # --- Unix sockets between programs of one computer: a name, the process at the other end, lines of JSON ---
 
@@ -115,9 +115,9 @@ class BusLock:
         self._server: socket.socket | None = None
         self._number = -1  # of the name that this lock has
         self._thread: threading.Thread | None = None
-        if not _has_lock(interface):
+        self._name = lock_name(interface, channel) if _has_lock(interface) else ""
+        if not self._name:
             return
-        self._name = lock_name(interface, channel)
         try:
             self._take_free_name()
             self._wake, self._woken = socket.socketpair()
@@ -143,7 +143,7 @@ class BusLock:
 
     def settle(self) -> None:
         """The program ends because of a stop, of this bus or of another one that it has: it knows of all of them."""
-        if self._thread is not None:
+        if self._name:
             settle(self._name)
 
     def close(self) -> None:
@@ -406,7 +406,7 @@ def lock_name(interface: str, channel: str) -> str:
             place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}:{found.st_ctime_ns:x}"
     elif interface == "serial" or port_path(channel).startswith("/"):
         place = f"{interface}:{os.path.realpath(port_path(channel))}"
-    return "jointctl-bus-" + hashlib.sha256(place.encode()).hexdigest()[:32]
+    return LOCKS + hashlib.sha256(place.encode()).hexdigest()[:32]
 
 
 def _address(name: str, number: int) -> bytes:
@@ -452,7 +452,7 @@ class StopCall:
         self._ask()
 
     def _note(self) -> None:
-        """The first one is for all that run, the second one for those that were started since."""
+        """The first one is for all that run, each further one for those that were started since."""
         try:
             if _has_lock(self._place[0]):
                 self._noted_ns = write_note(self._name, self._noted_ns)
@@ -471,35 +471,11 @@ class StopCall:
         for holder in self._holders:
             holder.close()
 
-    def end(self, note: Callable[[str], None], ended: Callable[[], None] = lambda: None) -> bool:
+    def end(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
         """The processes of a controller have ended when this returns, or `note` got why not.  Whether there was one.
 
-        `ended` is called each time a controller has: it may have enabled the drive before.
+        `ended` is called where there was: it may have enabled the drive before.
         """
-        return self._end_controllers(note, ended)
-
-    def again(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
-        """As `end`, for what has been started since, or has taken the lock after the first request."""
-        self._note()
-        self._ask_again()
-        return self._end_controllers(note, ended)
-
-    def clear_away(self, note: Callable[[str], None]) -> None:
-        """Notes that count no longer; `note` gets why ours could not be written."""
-        if self._unnoted is not None:
-            note(
-                f"the stop cannot be noted for a program that is just starting ({self._unnoted}): "
-                "look whether there is one, and stop again when it runs"
-            )
-        elif _has_lock(self._place[0]):
-            with contextlib.suppress(OSError):
-                remove_old(self._name)
-
-    def _ask_again(self) -> None:
-        self.__exit__()
-        self._ask()
-
-    def _end_controllers(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
         wait_for_answers(self._holders)
         marked = marked_processes(self._name)
         if marked and not any(holder.is_controller for holder in self._holders):  # it may have come after the request
@@ -524,6 +500,27 @@ class StopCall:
         if controllers or marked:
             ended()
         return bool(controllers or marked)
+
+    def again(self, note: Callable[[str], None], ended: Callable[[], None]) -> bool:
+        """As `end`, for what has been started since, or has taken the lock after the first request."""
+        self._note()
+        self._ask_again()
+        return self.end(note, ended)
+
+    def clear_away(self, note: Callable[[str], None]) -> None:
+        """Notes that count no longer; `note` gets why ours could not be written."""
+        if self._unnoted is not None:
+            note(
+                f"the stop cannot be noted for a program that is just starting ({self._unnoted}): "
+                "look whether there is one, and stop again when it runs"
+            )
+        elif _has_lock(self._place[0]):
+            with contextlib.suppress(OSError):
+                remove_old(self._name)
+
+    def _ask_again(self) -> None:
+        self.__exit__()
+        self._ask()
 
     def _end_by_force(self, note: Callable[[str], None]) -> None:
         """SIGTERM, then SIGKILL, to every process that still acts for the controller."""

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 FOLDER = Path("/dev/shm")
+LOCKS = "jointctl-bus-"  # what the name of each lock begins with
 KEPT_S = 86_400.0  # no program takes so long from its start to its bus
 MOST = 64  # that are kept of a lock
 SHARED_S = 60.0
@@ -81,8 +82,8 @@ def write_note(lock: str, began_ns: int = 0) -> int:
 
 def remove_old(lock: str) -> None:
     """Those that count no longer, of all locks, and of this one what is more than `MOST`."""
-    every = [(note, path) for path in _files("jointctl-bus-*") if (note := _read(path)) is not None]
-    outdated = [path for note, path in every if not _counts(note)]
+    every = [(note, path) for path in _files(f"{LOCKS}*") if (note := _read(path)) is not None]
+    outdated = [path for note, path in every if not _is_valid(note)]
     newest_first = sorted(((note.time_ns, path) for note, path in every if path.name.startswith(_prefix(lock))))[::-1]
     for path in [path for _, path in newest_first[MOST:]] + outdated:
         with contextlib.suppress(OSError):  # another stop was quicker, or it is root's
@@ -94,17 +95,14 @@ def stopped(lock: str) -> bool:
 
     A stop that came from this process itself, as by `subprocess.run`, counts only after it has asked for the joint.
     """
-    me = _process(os.getpid())
-    settled_ns, began_ns = _settled_ns.get(lock, 0), max(_began_ns(), _anew_ns)
-    found = False
-    for note in filter(None, map(_read, _files(lock))):
-        if not _counts(note) or began_ns < note.began_ns:
-            continue
-        since_ns = began_ns
-        if me in note.by:
-            since_ns = _asked_ns if _asked_ns is not None else note.time_ns + 1
-        found = found or (note.time_ns > settled_ns and note.time_ns >= since_ns)
-    return found
+    me, began_ns, settled_ns = _process(os.getpid()), max(_began_ns(), _anew_ns), _settled_ns.get(lock, 0)
+
+    def counts(note: _Note) -> bool:
+        since_ns = _asked_ns if me in note.by else began_ns
+        is_for_it = since_ns is not None and note.time_ns >= since_ns and began_ns >= note.began_ns
+        return is_for_it and note.time_ns > settled_ns and _is_valid(note)
+
+    return any(counts(note) for note in map(_read, _files(lock)) if note is not None)
 
 
 def _prefix(lock: str) -> str:
@@ -116,7 +114,7 @@ def _files(lock: str) -> Iterator[Path]:
         yield from FOLDER.glob(f"{_prefix(lock)}*")
 
 
-def _counts(note: _Note) -> bool:
+def _is_valid(note: _Note) -> bool:
     return 0 <= now_ns() - note.time_ns <= KEPT_S * 1e9
 
 

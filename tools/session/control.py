@@ -215,7 +215,7 @@ def _locked(
 
     A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.
     """
-    words = ""
+    words = "; nothing moved"  # until the program has its locks
     try:
         with ExitStack() as stack:
             locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
@@ -226,10 +226,10 @@ def _locked(
             if signals.commanded_ns or any(lock.stopped for lock in locks):
                 for lock in locks:
                     lock.settle()
-                words = "; nothing moved"
                 signals.on_stop_command()
                 if signals.raising:
                     signals.leave_if_asked()
+            words = ""
             yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{signals.by_command}{words}") from None

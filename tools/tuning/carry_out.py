@@ -254,11 +254,13 @@ def _stage(
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
     """Once more where legs were lost to a computer that stood still for a moment: a tune of minutes need not end."""
     motion = task.motion(peak_Nm, pairs)
-    title = f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm"
-    carried = carrier.run(task.config, motion, title)
-    try:
+
+    def measured() -> tuple[FrequencyResponse, Any, ResponsePlan]:
+        carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
         return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
+
+    try:
+        return measured()
     except DataError as error:
         carrier.output.note(f"  {error.message}: once more")
-    carried = carrier.run(task.config, motion, title)
-    return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
+    return measured()

@@ -273,7 +273,7 @@ def test_a_stop_goes_before_ordinary_programs_where_that_is_allowed(
 
 
 def test_every_verb_that_controls_a_bus_is_known_before_its_imports() -> None:
-    """Else a stop that comes while it is starting ends nothing, and the joint moves all the same."""
+    """Else SIGTERM, or a terminal that is closed, ends it without a word while it is starting."""
     sources = Path(run_verb.__file__).parent.glob("*.py")
     controlling = {path.stem.replace("_", "-") for path in sources if CONTROLS.search(path.read_text())}
     controlling -= {"params", "doctor"}  # with some of their words only

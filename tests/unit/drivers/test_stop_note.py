@@ -407,6 +407,9 @@ def test_where_no_lock_can_be_had_the_notes_count_all_the_same(monkeypatch: pyte
         with BusLock("socketcan", "tested-no-socket") as lock:
             assert lock.stopped is expected
         write_note(lock_name("socketcan", "tested-no-socket"))
+    lock.settle()
+    with BusLock("socketcan", "tested-no-socket") as lock:
+        assert not lock.stopped  # it was told: once
 
 
 @pytest.mark.usefixtures("others")
@@ -420,7 +423,7 @@ def test_a_stop_looks_at_all_its_buses_until_no_one_is_left(monkeypatch: pytest.
             super().__init__("socketcan", f"tested-looks-{name}")
             self.name = name
 
-        def _end_controllers(self, note: Any, ended: Any) -> bool:
+        def end(self, note: Any, ended: Any) -> bool:
             looks.append(self.name)
             return found[self.name].pop(0)
 
