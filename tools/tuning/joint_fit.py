@@ -156,13 +156,18 @@ class _Model:
         return TwoMasses(motor, link, omega * omega * reduced, damping, (0.0, 0.0), (viscous, 0.0))
 
     def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
+        """Without bound for a trial that grows beyond all numbers in one period: the search turns back there."""
         joint, late = self.joint(x), (math.exp(x[1]), math.exp(x[2]))
         rows = [np.array([(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD])]
-        for part in self.parts:
-            side = part.side if self.flexible else "motor"
-            model = _response(joint, *late, self.period_s, part.frequency_Hz)[side]
-            off = np.log(model / part.measured) / part.sigma
-            rows += [off.real, off.imag]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for part in self.parts:
+                side = part.side if self.flexible else "motor"
+                try:
+                    model = _response(joint, *late, self.period_s, part.frequency_Hz)[side]
+                except np.linalg.LinAlgError:
+                    return np.full(self.count + 1, np.inf)
+                off = np.log(model / part.measured) / part.sigma
+                rows += [off.real, off.imag]
         return np.concatenate(rows)
 
     def fitted(self, start: list[float]) -> OptimizeResult:

@@ -220,6 +220,14 @@ def test_a_rigid_joint_is_not_taken_for_two_masses(seed: int) -> None:
     assert fit.late_s.value == pytest.approx(1.4e-3, abs=0.05e-3)
 
 
+def test_a_search_that_comes_to_a_joint_that_runs_away_turns_back() -> None:
+    """Without friction, or with one that drives it, a light joint grows beyond all numbers in one period."""
+    light = TwoMasses(0.0738, 0.0317, 832.0, 0.2146, (0.0, 0.0), (0.6313, 0.0))
+    fit = fit_joint(made_response(light, (1.3e-3, 0.6e-3), 32), 0.21)
+    assert fit.flexible
+    assert fit.inertia_kgm2.value == pytest.approx(0.1055, rel=0.03)
+
+
 def test_a_response_without_coherence_gives_no_model() -> None:
     found = made_response(RIGID, (1e-3, 0.0))
     assert found.motor is not None
