@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it; before numpy
+
 import dataclasses
 import functools
-import os
 import signal
 import sys
 from collections import Counter
