@@ -143,6 +143,7 @@ def test_every_reader_refuses_what_is_no_file(tmp_path: Path, name: str) -> None
 
 # --- Ctrl-C before a verb has begun, and in the worker processes of one ---
 STUCK = (
+    "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL);"  # which `nohup pytest` has ignored
     "import sys, time, types; sys.modules['typer'] = slow = types.ModuleType('typer');"
     "slow.__getattr__ = lambda name: (print('importing', flush=True), time.sleep(60));"
     "import jointctl.tools.verbs.start as start; start.main()"
