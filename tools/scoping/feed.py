@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import secrets
+import select
 import socket
 import subprocess
 import sys
@@ -40,6 +41,7 @@ SERVER_SILENT = (
 )
 SCOPE = "the scope"
 OVER = "over"  # the last stage: the program ends as it should, and nothing moves any more
+LAST_WORD_S = 1.0  # without it the pages fear that the joint may move
 SERVER_ENDED = "{}'s server has ended: no page shows or stops the joint"
 
 
@@ -169,6 +171,11 @@ class ScopeFeed:
         """Tell the pages what can be changed, or in which stage things are."""
         self.send(SETTINGS, json.dumps(dict(values)).encode())
 
+    def over(self) -> None:
+        """The last stage; it waits for room, where other messages are dropped."""
+        select.select([], [self._end], [], LAST_WORD_S)
+        self.settings({"stage": OVER})
+
     def _receive(self) -> None:
         with contextlib.suppress(OSError):
             for _ in range(AT_ONCE):
@@ -271,7 +278,7 @@ def scope_server(
         try:
             yield feed
         finally:
-            feed.settings({"stage": OVER})
+            feed.over()
 
 
 @contextmanager

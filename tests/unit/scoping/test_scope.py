@@ -7,6 +7,8 @@ import io
 import json
 import math
 import socket
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -200,6 +202,25 @@ def test_a_feed_of_states_passes_on_few_records_in_few_messages_and_all_in_the_e
         cycles = np.frombuffer(b"".join(bodies), dtype_of(LogRecord))["cycle"]
         np.testing.assert_array_equal(cycles, np.arange(0, 20 * looks, 10))
         assert len(bodies) <= looks * 0.02 / feed_module.STATES_S + 2
+
+
+def test_the_last_stage_arrives_also_where_the_server_is_slow(ends: tuple[socket.socket, socket.socket]) -> None:
+    """Otherwise its pages would go on to say that the joint may move."""
+    feed = ScopeFeed(ends[0])
+    while not feed.dropped:
+        feed.show(snapshot(records(20)))
+    found: list[bytes] = []
+
+    def read() -> None:
+        time.sleep(0.05)
+        while b"over" not in (found or [b""])[-1]:
+            found.append(ends[1].recv(1 << 20))
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    feed.over()
+    reader.join(20.0)
+    assert found[-1] == SETTINGS + b'{"stage": "over"}'
 
 
 def test_a_server_that_reads_nothing_or_is_gone_costs_the_run_nothing(
