@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 LEVEL = 0.95
 GOOD_COHERENCE = 0.9
+WORST_RELATIVE = 0.7  # of its interval: such a line says nothing
 LEAST_LEGS = 4
 MOST_LOST = 0.01  # share of the cycles of a leg that were skipped
 TO_SIGMA = 1.4826  # of a median of absolute values
@@ -176,9 +177,12 @@ def response_of(config: Config, plan: ResponsePlan, records: np.recarray) -> Fre
 def grown(before: FrequencyResponse, after: FrequencyResponse) -> float:
     """The factor by which the highest peak of the acceleration is higher than with a smaller torque.
 
-    Of the peaks and not line by line: with more torque hysteresis lets a resonance come down a little.
+    Of the peaks and not line by line: with more torque hysteresis lets a resonance come down a little.  Of lines that
+    both responses know: the lowest may have coherence by chance and an interval of ten times its value.
     """
-    good = (before.fed.coherence > GOOD_COHERENCE) & (after.fed.coherence > GOOD_COHERENCE)
+    good = np.ones(len(before.frequency_Hz), bool)
+    for channel in (before.fed, after.fed):
+        good &= (channel.coherence > GOOD_COHERENCE) & (channel.half < WORST_RELATIVE)
     peaks = [
         np.max(np.abs(one.fed.response[good]) * one.frequency_Hz[good] ** 2, initial=0.0) for one in (before, after)
     ]

@@ -21,10 +21,16 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.states import Encoders
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
 from jointctl.tools.tuning.excitation import ResponsePlan
-from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, LEVEL, Channel, ComplexArray, FrequencyResponse
+from jointctl.tools.tuning.frequency_response import (
+    GOOD_COHERENCE,
+    LEVEL,
+    WORST_RELATIVE,
+    Channel,
+    ComplexArray,
+    FrequencyResponse,
+)
 
 LEAST_RELATIVE = 0.02  # of a line: what no model describes
-WORST_RELATIVE = 0.7  # of its interval: such a line says nothing
 LEAST_LINES = 12
 SOFT = 1.5  # residuals beyond so many deviations count less
 DAMPING_SHARE = 0.04  # of the critical damping, where a fit begins

@@ -176,6 +176,16 @@ def test_a_resonance_that_comes_down_does_not_grow_and_one_that_grows_does() -> 
     assert grown(before, undamped) > 2.5
 
 
+@pytest.mark.parametrize(("half", "counts"), [(11.0, False), (0.3, True)])
+def test_a_line_that_is_hardly_known_does_not_grow(half: float, counts: bool) -> None:
+    """The lowest line of a rigid joint: coherence 0.98 by chance, four times the others, and an interval of that."""
+    before = made_response(RIGID, (1e-3, 5e-4))
+    after = made_response(RIGID, (1e-3, 5e-4), seed=2)
+    after.fed.response[0] *= 4.0
+    after.fed.half[0] = half
+    assert (grown(before, after) > 2.5) is counts
+
+
 def test_legs_that_were_lost_do_not_count_and_too_few_are_refused() -> None:
     made = plan(pairs=3)
     log = records_of(made, RIGID)
