@@ -164,7 +164,8 @@ class Tune:
                 getattr(self, f"_take_{name}", lambda _: None)(self.state[name])
             except JointctlError as error:
                 kept = f"{self.original.path} is as it was, {self.folder} has the steps before"
-                raise type(error)(f"{name}: {error.message}; {kept}", error.hint) from None
+                seen = error.message.removeprefix(f"{name}: ")
+                raise type(error)(f"{name}: {seen}; {kept}", error.hint) from None
         if self.options.refine:
             self._refine()
 
@@ -177,7 +178,8 @@ class Tune:
             try:
                 kept = json.loads(path.read_text())
             except (OSError, ValueError) as error:
-                raise DataError(f"{path}: cannot be read: {error}", "without --resume it begins anew") from None
+                why = error.strerror if isinstance(error, OSError) else str(error)
+                raise DataError(f"{path}: cannot be read: {why}", "without --resume it begins anew") from None
             own = kept.get("about", {})
             if about not in (own, {**own, "configuration": kept.get("written")}):
                 raise DataError(
