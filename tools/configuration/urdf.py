@@ -179,6 +179,8 @@ class _Reader:
         name = element.get("name", "")
         if not name:
             self._problem(f"an element {tag} has no name")
+        elif not name.isprintable():
+            self._problem(f"{tag} {name}: its name must have no control characters")
         return name
 
     def _one(self, element: ElementTree.Element, tag: str, what: str) -> ElementTree.Element | None:
