@@ -198,15 +198,16 @@ def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) ->
     if sample.bus_errors >= LINE_GONE and state.phase >= AxisPhase.QUICK_STOPPING:
         enter(state, AxisPhase.FINISHED)
         return
-    off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
-    off = off and state.sample_age_cycles == 0 and state.phase_cycle > ANSWER_CYCLES
+    reads_off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
+    off = reads_off and state.sample_age_cycles == 0 and state.phase_cycle > ANSWER_CYCLES
     if state.phase == AxisPhase.QUICK_STOPPING:
         if off:
             enter(state, AxisPhase.DISABLING)
+            state.ready = 1  # it has answered: `jointctl stop` may take the node out of operational now
         elif state.phase_cycle > constants.sequence.stop_max_cycles:
             react(state, Reaction.OFF)
     elif state.phase == AxisPhase.DISABLING:
-        if off:
+        if off or (reads_off and state.ready != 0):
             enter(state, AxisPhase.FINISHED)
         elif waited_too_long(state, constants.sequence.off_max_cycles):
             trip(state, Fault.OFF_TIMEOUT, float(sample.status_word), sample.drive_error)

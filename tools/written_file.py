@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,6 +21,20 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+_LONGEST_STEM = 50  # letters, of up to four bytes each; a file system takes 255 bytes
+
+
+def file_stems(names: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
+    """Of files named after these, all different, whatever the file system thinks of capitals."""
+    found: list[str] = []
+    for name in names:
+        stem = re.sub(r"[^\w.-]+", "_", name).strip(".")[:_LONGEST_STEM] or "joint"
+        while stem.lower() in {*taken, *map(str.lower, found)}:
+            stem += "_joint"
+        found.append(stem)
+    return found
 
 
 def refuse_overwriting(path: Path, inputs: Iterable[Path]) -> None:

@@ -272,7 +272,8 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     bodies, inertias = _bodies(path, arm, urdf, names, alone)
     joints = _moved(path, file.motion, alone, names)
     raise_if([f"{path}: {line}" for line in (*bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
-    remarks += [f"{urdf.path.name}: {line}" for line in (*_odd_limits(bodies), *_odd_effort(bodies))]
+    odd = (*urdf.remarks, *_odd_limits(bodies), *_odd_effort(bodies))
+    remarks += [f"{urdf.path.name}: {line}" for line in odd]
     for config, body in zip(joints, bodies, strict=True):
         remarks += [f"{config.path.name}: {line}" for line in _larger(config, body)]
     return ArmConfig(

@@ -102,6 +102,7 @@ class Urdf:
     root: str
     links: dict[str, Mass | None]  # None: without <inertial>
     joints: tuple[UrdfJoint, ...]  # a parent's joint before those of its children
+    remarks: tuple[str, ...] = ()  # what may be right and looks like another unit
 
     @property
     def moving(self) -> tuple[UrdfJoint, ...]:
@@ -151,7 +152,7 @@ class _NoDoctype(ElementTree.TreeBuilder):
 
 class _Reader:
     def __init__(self, path: Path) -> None:
-        self._path, self._problems = path, list[str]()
+        self._path, self._problems, self._remarks = path, list[str](), list[str]()
 
     def read(self, robot: ElementTree.Element) -> Urdf:
         if next((one for one in robot.iter() if "xacro" in one.tag), None) is not None:
@@ -167,7 +168,7 @@ class _Reader:
                 if name and count > 1:
                     self._problem(f"{tag} {name} is there {count} times: each must have a name of its own")
         raise_if(self._problems)
-        found = Urdf(self._path, *self._tree(links, joints))
+        found = Urdf(self._path, *self._tree(links, joints), tuple(self._remarks))
         raise_if(self._problems)
         return found
 
@@ -178,6 +179,8 @@ class _Reader:
         name = element.get("name", "")
         if not name:
             self._problem(f"an element {tag} has no name")
+        elif not name.isprintable():
+            self._problem(f"{tag} {name}: its name must have no control characters")
         return name
 
     def _one(self, element: ElementTree.Element, tag: str, what: str) -> ElementTree.Element | None:
@@ -217,6 +220,9 @@ class _Reader:
         odd = [angle for angle in angles if abs(angle) > math.pi and angle == round(angle)]
         if odd:  # beyond half a turn and a whole number is none of pi
             self._problem(f"{what}: rpy has the angle {odd[0]:g}, more than half a turn; {degrees}?")
+        elif odd := [angle for angle in angles if abs(angle) >= 1.0 and 2.0 * angle == round(2.0 * angle)]:
+            turn = math.degrees(odd[0])
+            self._remarks.append(f"{what}: rpy has the angle {odd[0]:g}, which is {turn:.4g} degrees; {degrees}?")
         return Pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), offset)
 
     def _joint(self, element: ElementTree.Element) -> UrdfJoint:

@@ -22,6 +22,7 @@ from jointctl.tools.configuration.arm import LARGEST_ARM, SHIPPED_ARM, ArmConfig
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.urdf import Urdf, UrdfJoint, bodies_of, read_urdf
 from jointctl.tools.inspection.first_values import Place, filled, toml_text
+from jointctl.tools.written_file import file_stems
 
 TEMPLATE = SHIPPED_ARM.parent / "shoulder.toml"
 ARM_FILE = "arm.toml"
@@ -82,15 +83,8 @@ def _unknown_limits(joint: UrdfJoint) -> list[str]:
 
 
 def file_names(joints: Sequence[UrdfJoint]) -> list[str]:
-    """Of the joints' configurations, all different, whatever the file system thinks of capitals."""
-    found: list[str] = []
-    for joint in joints:
-        stem = re.sub(r"[^\w.-]+", "_", joint.name).strip(".") or "joint"
-        taken = {"arm", *(name.removesuffix(".toml").lower() for name in found)}
-        while stem.lower() in taken:
-            stem += "_joint"
-        found.append(f"{stem}.toml")
-    return found
+    """Of the joints' configurations."""
+    return [f"{stem}.toml" for stem in file_stems([joint.name for joint in joints], taken=("arm",))]
 
 
 def default_motor_inertia_kgm2(joint: UrdfJoint) -> float:
@@ -235,12 +229,10 @@ def first_arm(
                     remarks.append(f"joint {arm.names[i]}: no gains were found for all poses; jointctl check says more")
                 gains.append(found or _GAINS[-1])
             draft = replace(draft, gains=tuple(gains))
-            draft.loaded(trial)
+            remarks += draft.loaded(trial).remarks
         except ConfigurationError as error:
             error.message = error.message.replace(f"{trial}", f"{folder}")
             raise
-    named = {joint.name for joint in joints}
-    remarks += [f"joint {one.name} stands at 0 for the model" for one in urdf.moving if one.name not in named]
     return draft.files(), remarks
 
 

@@ -15,7 +15,21 @@ import numpy as np
 
 from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
-from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SERIES, SOFT, TEAL, VIOLET
+from jointctl.tools.drawing import (
+    BLUE,
+    COLOURS,
+    EITHER_WAY,
+    GREEN,
+    GREY,
+    INK,
+    MID_BLUE,
+    ORANGE,
+    RED,
+    SERIES,
+    SOFT,
+    TEAL,
+    VIOLET,
+)
 from jointctl.tools.recording.report_page import Block, Figure, Paragraph, Table, draw
 from jointctl.tools.recording.run_log_reader import RunLog, began_at, event_rows, missing_in
 from jointctl.tools.recording.run_summary import (
@@ -46,6 +60,7 @@ _PARTS = (
     ("learned", "learned", TEAL),
 )
 _CLOUD_POINTS = 20_000
+_ROW_CHARACTERS, _HANDLE_CHARACTERS = 125, 6  # of a legend: wider, and nothing is left of the axes
 _LEAST_SPEED_radps = 1e-3
 _BINS = 25  # of speed, in each direction
 _LEAST_IN_BIN = 10
@@ -68,8 +83,11 @@ def _finish(axes: Axes, records: np.ndarray, ylabel: str, *, legend: bool = True
 
 def legend_above(axes: Axes) -> None:
     """Outside, and not at the side: the time axes of all figures are then equally wide."""
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=8, columnspacing=1.4, handlelength=1.6)
+    widths = [len(label) + _HANDLE_CHARACTERS for label in axes.get_legend_handles_labels()[1]]
+    if widths:
+        in_one_row = sum(widths) <= _ROW_CHARACTERS
+        columns = len(widths) if in_one_row else max(1, _ROW_CHARACTERS // max(widths))
+        axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=columns, columnspacing=1.4, handlelength=1.6)
 
 
 def _mark(axes: Axes, records: np.ndarray) -> None:
@@ -337,23 +355,33 @@ def at_times(records: np.ndarray, chosen: np.ndarray, name: str, time_s: np.ndar
     return np.interp(time_s, records["trajectory_s"][chosen], records[name][chosen])
 
 
+def _drawn(i: int) -> dict[str, Any]:
+    """How the line of run i is told from the others."""
+    colours = (*SERIES, *EITHER_WAY)
+    return {"color": colours[i % len(colours)], "linestyle": "-" if i < len(colours) else "--"}
+
+
+def _lines_of(axes: Axes, names: Sequence[str], runs: Sequence[Any], field: str, scale: float) -> None:
+    for i, (name, records) in enumerate(zip(names, runs, strict=True)):
+        rows = records[first_motion(records)]
+        if len(rows):
+            line(axes, rows["trajectory_s"], rows[field] * scale, label=name, linewidth=1.0, **_drawn(i))
+
+
 def _overlay(
     names: Sequence[str], runs: Sequence[Any], field: str, scale: float, unit: str, alt: str, caption: str
 ) -> Figure:
     def paint(figure: Picture) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
-        for i, (name, records) in enumerate(zip(names, runs, strict=True)):
-            rows = records[first_motion(records)]
-            if len(rows):
-                line(above, rows["trajectory_s"], rows[field] * scale, SERIES[i % len(SERIES)], name, linewidth=1.0)
+        _lines_of(above, names, runs, field, scale)
         for i, records in enumerate(runs[1:], 1):
             rows, chosen = aligned(runs[0], records)
             if len(rows) < _SHORTEST:
                 continue
             time_s = rows["trajectory_s"]
             difference = (at_times(records, chosen, field, time_s) - rows[field]) * scale
-            color = INK if len(runs) == 2 else SERIES[i % len(SERIES)]
-            line(below, time_s, difference, color, f"{names[i]} less {names[0]}", linewidth=0.9)
+            style = {"color": INK} if len(runs) == 2 else _drawn(i)
+            line(below, time_s, difference, label=f"{names[i]} less {names[0]}", linewidth=0.9, **style)
         below.axhline(0.0, color=SOFT, linewidth=0.7)
         above.set_ylabel(unit)
         below.set_ylabel(f"difference {unit.partition(' ')[2]}")
@@ -371,7 +399,7 @@ def _friction(names: Sequence[str], runs: Sequence[Any]) -> Figure:
         for i, (name, records) in enumerate(zip(names, runs, strict=True)):
             for number, rows in enumerate(binned(*friction_points(records))):
                 label = name if number == 0 else None
-                axes.plot(rows[:, 0], rows[:, 2], color=SERIES[i % len(SERIES)], label=label, linewidth=1.5)
+                axes.plot(rows[:, 0], rows[:, 2], label=label, linewidth=1.5, **_drawn(i))
         axes.set_xlabel("joint velocity [rad/s]")
         axes.set_ylabel("friction at the joint [Nm]")
         legend_above(axes)
@@ -400,6 +428,27 @@ def comparison(names: Sequence[str], runs: Sequence[Any]) -> list[Block]:
                  "Command torques at the same trajectory time; below, each less the first."),
         _friction(names, runs),
     ]  # fmt: skip
+
+
+def together(names: Sequence[str], runs: Sequence[Any]) -> list[Block]:
+    """The same of the joints of one arm, which move differently: no differences."""
+
+    def figure_of(field: str, scale: float, label: str, title: str) -> Figure:
+        def paint(figure: Picture) -> None:
+            axes = figure.subplots()
+            _lines_of(axes, names, runs, field, scale)
+            axes.set_ylabel(label)
+            axes.set_xlabel("trajectory time [s]")
+            legend_above(axes)
+
+        return draw(3.4, paint, f"{title} of each joint", f"{title} of each joint.")
+
+    return [
+        figure_of("position_rad", 1.0, "joint angle [rad]", "Measured angle"),
+        figure_of("error_rad", 1e3, "error [mrad]", "Tracking error"),
+        figure_of("command_torque_Nm", 1.0, "torque [Nm]", "Command torque"),
+        _friction(names, runs),
+    ]
 
 
 # --- Tables: what ran, the figures of the run side by side with their difference, the events ---

@@ -21,7 +21,7 @@ import numpy as np
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmLink, ArmMotion
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Near, Word
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
-from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.schema import dtype_of
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmModel
@@ -56,6 +56,7 @@ class SharedBlock:
         self.command = self._records(Command, axes)
         self.port = self._records(port, axes)
         self.arm_constants, self.links = self._records(ArmConstants, 1), self._records(ArmLink, axes)[:links]
+        self.motion = self._records(ArmMotion, axes + 1)[: links + 1]
         self.ring = self._records(LogRecord, RING_RECORDS)
 
     @classmethod
@@ -70,9 +71,11 @@ class SharedBlock:
 
     @staticmethod
     def _size(table_rows: int, port: type, axes: int) -> int:
-        records = (AxisConstants, AxisState, Sample, Command, port, ArmLink)
+        records = (AxisConstants, AxisState, Sample, Command, port, ArmLink, ArmMotion)
         words = WORDS + len(Histogram) * HISTOGRAM_BINS + axes * table_rows * 5
-        rest = RING_RECORDS * dtype_of(LogRecord).itemsize + dtype_of(ArmConstants).itemsize
+        rest = (
+            sum(dtype_of(r).itemsize for r in (ArmConstants, ArmMotion)) + RING_RECORDS * dtype_of(LogRecord).itemsize
+        )
         return 8 * words + axes * sum(dtype_of(r).itemsize for r in records) + rest + 20 * _LINE
 
     def of_axis(self, axis: int) -> SharedBlock:
@@ -95,14 +98,14 @@ class SharedBlock:
         return CycleMemory(
             self.constants, self.state, self.tables, self.sample, self.command, self.words, self.ring,
             self.histograms, np.zeros(2, np.int64),
-            Arm(self.arm_constants, self.links, new(ArmMotion, len(self.links) + 1)),
+            Arm(self.arm_constants, self.links, self.motion),
         )  # fmt: skip
 
     def near(self) -> Near:
         """What each cycle reads of every axis."""
         words = np.frombuffer(self._memory, np.int64, len(self._memory) // 8)
         parts = []
-        for array in (self.constants, self.state, self.sample, self.command, self.port, self.links):
+        for array in (self.constants, self.state, self.sample, self.command, self.port, self.links, self.motion):
             first = array.ctypes.data - words.ctypes.data
             for at in range(first, first + array.nbytes, array.itemsize):
                 parts += [((at + begin) // 8, (at + end) // 8) for begin, end in _small_parts(array.dtype)]

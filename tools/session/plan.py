@@ -36,6 +36,7 @@ from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path, remove_oldest, require_room
 from jointctl.tools.session.fault_words import fault_text
+from jointctl.tools.written_file import file_stems
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
@@ -225,8 +226,8 @@ def resolve_arm(
     named._path = arm.path
     path = log_path(named)
     joints = []
-    for config, name in zip(arm.joints, arm.names, strict=True):
-        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{name}.mcap"), name))
+    for config, name, stem in zip(arm.joints, arm.names, file_stems(arm.names), strict=True):
+        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{stem}.mcap"), name))
     first = joints[0]
     plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)

@@ -161,7 +161,7 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
         poses = loop.poses
         table.add_row(
             loop.name, f"{poses.least_kgm2:.3g} .. {poses.greatest_kgm2:.3g} kg m2",
-            f"over the poses; joint.inertia_kgm2 = {own:g}, gravity up to {poses.gravity_Nm:.3g} Nm",
+            f"over the poses; joint.inertia_kgm2 = {own:g}, gravity up to {round(poses.gravity_Nm, 9):.3g} Nm",
         )  # fmt: skip
         margin = f"{found.phase_margin_deg:.1f} deg" if found.stable else "UNSTABLE"
         table.add_row("  phase margin", margin, f"worst case: {found.joint}; {minimum_deg:g} deg wanted")

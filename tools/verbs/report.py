@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jointctl.tools.recording.run_log_reader import RunLog
     from jointctl.tools.recording.run_summary import RunSummary
 
-MOST_LOGS = 6  # columns that fit on a page
+MOST_LOGS = 16  # as many as the largest arm has joints
 
 
 def report(
@@ -36,8 +36,10 @@ def report(
     for path, log in zip(paths, logs, strict=True):
         if len(log.records) < 2:
             raise DataError(f"{path}: nothing to report, the run has {len(log.records)} records")
-    names = log_names(paths)
-    html = page(" and ".join(names), report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
+    names = of_one_arm(logs)
+    title = f"{paths[0].stem.removesuffix(f'.{names[0]}')}: {', '.join(names)}" if names else ""
+    title, names = title or " and ".join(log_names(paths)), names or log_names(paths)
+    html = page(title, report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
     write_page(target, html, paths)
     output.result(str(target), {"report": str(target), "logs": [str(path) for path in paths]}, target)
     return 0
@@ -49,6 +51,14 @@ def log_names(paths: Sequence[Path]) -> list[str]:
     return [stem if stems.count(stem) == 1 else f"{stem} ({i})" for i, stem in enumerate(stems, 1)]
 
 
+def of_one_arm(logs: Sequence[RunLog]) -> list[str]:
+    """The joints' names where all are different joints of one arm; else empty."""
+    arms = [log.metadata.get("arm", {}) for log in logs]
+    names = [arm.get("joint", "") for arm in arms]
+    same = len({arm.get("configuration") for arm in arms}) == 1
+    return names if len(logs) > 1 and all(names) and len(set(names)) == len(names) and same else []
+
+
 def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Section]:
     """The body of the page."""
     from jointctl.firmware_py.states import Fault
@@ -58,6 +68,7 @@ def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Sectio
         figure_tables,
         run_figures,
         temperature_figure,
+        together,
         what_ran,
     )
     from jointctl.tools.recording.report_page import Details, Paragraph, Section
@@ -73,7 +84,9 @@ def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Sectio
         Section("In numbers", figure_tables(names, logs, summaries)),
     ]
     if len(logs) > 1:
-        sections.append(Section("Side by side", comparison(names, [log.records for log in logs])))
+        records = [log.records for log in logs]
+        blocks = together(names, records) if of_one_arm(logs) else comparison(names, records)
+        sections.append(Section("Side by side", blocks))
     for name, log in zip(names, logs, strict=True):
         title = "Figures" if len(logs) == 1 else f"Figures of {name}"
         sections.append(Section(title, [*run_figures(log.records), *temperature_figure(log)]))

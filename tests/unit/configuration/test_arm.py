@@ -68,14 +68,15 @@ URDF = """<robot name="skew">
     <axis xyz="1 2 -0.5"/></joint>
   <link name="one"><inertial><origin xyz="0.1 0 0.02" rpy="0.2 0.5 0.1"/><mass value="2"/>
     <inertia ixx="0.02" ixy="0.003" ixz="0.001" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial></link>
-  <joint name="flange" type="fixed"><parent link="one"/><child link="plate"/><origin xyz="0.2 0 0" rpy="0 1 0"/></joint>
+  <joint name="flange" type="fixed"><parent link="one"/><child link="plate"/>
+    <origin xyz="0.2 0 0" rpy="0 1.1 0"/></joint>
   <link name="plate"><inertial><origin xyz="0 0.05 0"/><mass value="0.5"/>
     <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.0015"/></inertial></link>
   <joint name="finger" type="prismatic"><parent link="plate"/><child link="tip"/><origin xyz="0 0 0.1"/>
     <axis xyz="0 1 0"/><limit lower="0" upper="0.05" velocity="1" effort="10"/></joint>
   <link name="tip"><inertial><mass value="0.1"/>
     <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
-  <joint name="b" type="revolute"><parent link="plate"/><child link="two"/><origin xyz="0.3 0 0" rpy="0 0 1"/>
+  <joint name="b" type="revolute"><parent link="plate"/><child link="two"/><origin xyz="0.3 0 0" rpy="0 0 0.9"/>
     <axis xyz="0 -1 0"/><limit lower="-3" upper="3" velocity="9" effort="900"/></joint>
   <link name="two"><inertial><origin xyz="0 0 0.2"/><mass value="1"/>
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.004"/></inertial></link>
@@ -216,6 +217,7 @@ IN_URDF: list[tuple[str, str, str]] = [
     (r"^.*$", '<sdf version="1.6"/>', "the outermost element (=sdf) must be robot"),
     (r"</robot>", "<!--" + "x" * (17 << 20) + "--></robot>", "at most 16777216 are read"),
     (r'name="elbow"', 'name="shoulder"', "joint shoulder is there 2 times"),
+    (r'name="elbow"', 'name="el&#10;bow"', "its name must have no control characters"),
     (r'<link name="hand">', '<link name="forearm"/><link name="hand">', "link forearm is there 2 times"),
     (
         r"</robot>",
@@ -386,3 +388,16 @@ def test_a_limit_of_a_whole_number_beyond_a_turn_is_named(folder: Path) -> None:
     assert [line for line in remarks(folder) if "limit lower (=-10) is more than a turn; degrees" in line]
     change(folder / "arm.urdf", r'lower="[^"]*"', 'lower="-6.2831853"')
     assert remarks(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("angle", "said"),
+    [("2", "114.6 degrees"), ("-1", "-57.3 degrees"), ("1.5", "85.94 degrees"), ("1.57", None), ("0.5", None)],
+)
+def test_a_few_degrees_in_an_rpy_are_named(folder: Path, angle: str, said: str | None) -> None:
+    for place, what in (('xyz="0.30 0 0"', "joint wrist"), ('<origin xyz="0.05 0 0"', "link hand: inertial")):
+        before = (folder / "arm.urdf").read_text()
+        change(folder / "arm.urdf", place, f'{place} rpy="0 {angle} 0"')
+        wanted = [f"arm.urdf: {what}: rpy has the angle {angle}, which is {said}; degrees instead of rad?"]
+        assert remarks(folder) == (wanted if said else [])
+        (folder / "arm.urdf").write_text(before)

@@ -18,6 +18,7 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepArm
+from jointctl.tools.session.plan import resolve_arm
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.arms import long_arm
 from tests.sessions import output
@@ -114,8 +115,26 @@ def test_names_that_are_no_file_names(tmp_path: Path) -> None:
     text = robot(joint(1, limit, name="arm") + joint(2, limit, name=odd.replace('"', "&quot;")))
     arm = load_arm(made(tmp_path, text))
     assert arm.names == ("arm", odd)
+    plan = resolve_arm(arm).arm
+    assert plan is not None
+    assert len({joint.log_path.name for joint in plan.joints}) == 2
     assert all(config.path.parent == tmp_path / "arm" for config in arm.joints)
     assert len({config.path.name.lower() for config in arm.joints} | {"arm.toml"}) == 3
+
+
+def test_names_too_long_for_a_file_system(tmp_path: Path) -> None:
+    limit = LIMIT.format(effort=60)
+    text = robot(joint(1, limit, name="\u00e9" * 400) + joint(2, limit, name="\u00e9" * 401))
+    assert [len(name) for name in load_arm(made(tmp_path, text)).names] == [400, 401]
+
+
+def test_what_check_remarks_is_said_at_once(tmp_path: Path) -> None:
+    finger = '<joint name="f" type="revolute"><parent link="l2"/><child link="f"/><mimic joint="j1"/></joint>'
+    odd = GOOD.replace("</robot>", f'<link name="f"/>{finger}</robot>')
+    (tmp_path / "odd.urdf").write_text(odd)
+    out, _, said = output()
+    assert new(tmp_path / "arm", out, arm=True, urdf=tmp_path / "odd.urdf", no_input=True) == 0
+    assert "mimics j1: for the model it stands at 0" in " ".join(said.getvalue().split())
 
 
 @pytest.mark.parametrize(

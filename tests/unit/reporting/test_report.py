@@ -247,8 +247,14 @@ def run_records(count: int = 3000, rate_Hz: float = 1000.0, from_s: float = 0.0)
     return records
 
 
-def write_log(path: Path, records: Any, configuration: str = "[control]\nkind = 'pid'\nkp = 1.0\n") -> Path:
-    with RunLogWriter(path, {"run": {"configuration": configuration, "path": "joint.toml"}}) as log:
+def write_log(
+    path: Path,
+    records: Any,
+    configuration: str = "[control]\nkind = 'pid'\nkp = 1.0\n",
+    arm: dict[str, str] | None = None,
+) -> Path:
+    metadata = {"run": {"configuration": configuration, "path": "joint.toml"}, **({"arm": arm} if arm else {})}
+    with RunLogWriter(path, metadata) as log:
         log.write_records(records)
         log.write_event(INFO, "loop", "tracking <b>", int(records.time_ns[0]))
     return path
@@ -335,6 +341,34 @@ def test_two_runs_are_compared_at_the_same_trajectory_time(tmp_path: Path) -> No
     assert "b less a" in html
     assert "different motions" not in html
     assert (tmp_path / "a.comparison.html").exists()
+
+
+def arm_logs(folder: Path, joints: int, arms: int = 1) -> list[Path]:
+    paths = []
+    for i in range(joints):
+        arm = {"configuration": f"arm {i % arms}", "joint": f"quite_a_long_name_of_axis{i}"}
+        records = run_records()
+        for name in ("desired_position_rad", "position_rad", "error_rad", "command_torque_Nm", "measured_torque_Nm"):
+            records[name] += 0.1 * i
+        records.wake_late_ns += 1000 * i  # a picture that is there twice would have its ids twice
+        paths.append(write_log(folder / f"arm-1.{arm['joint']}.mcap", records, arm=arm))
+    return paths
+
+
+def test_joints_of_one_arm_are_shown_together_without_differences(tmp_path: Path) -> None:
+    html = made(arm_logs(tmp_path, MOST_LOGS))  # a legend that leaves no room for axes is a warning, which fails
+    check(html)
+    names = [f"quite_a_long_name_of_axis{i}" for i in range(MOST_LOGS)]
+    assert f"<h1>arm-1: {', '.join(names)}</h1>" in html
+    assert html.count("Tracking error of each joint.") == 1
+    assert f"less {names[0]}" not in html
+    assert "different motions" not in html
+
+
+def test_joints_of_two_arms_are_compared(tmp_path: Path) -> None:
+    html = made(arm_logs(tmp_path, 2, arms=2))
+    assert "axis1 less arm-1." in html
+    assert "different motions" in html
 
 
 def test_runs_are_compared_until_one_of_them_changed_its_motion() -> None:

@@ -45,6 +45,24 @@ def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
     assert state.fault == Fault.NONE
 
 
+@pytest.mark.parametrize(
+    ("then", "age_cycles", "phase"),
+    [
+        (DriveState.OFF, 1, AxisPhase.FINISHED),  # silent: `jointctl stop` has taken the node out of operational
+        (DriveState.OFF, 0, AxisPhase.FINISHED),
+        (DriveState.ENABLED, 0, AxisPhase.DISABLING),  # another one has enabled it
+    ],
+)
+def test_a_drive_that_was_off_after_its_quick_stop_need_not_say_so_again(
+    axis: Any, state: Any, then: DriveState, age_cycles: int, phase: AxisPhase
+) -> None:
+    state.phase, state.phase_cycle = AxisPhase.QUICK_STOPPING, ANSWER_CYCLES + 1
+    step_stopping(axis, state, sample_of(DriveState.OFF))
+    state.phase_cycle, state.sample_age_cycles = 1, age_cycles
+    step_stopping(axis, state, sample_of(then))
+    assert (state.phase, state.fault) == (phase, Fault.NONE)
+
+
 @pytest.mark.parametrize("bus_errors", [LINE_GONE - 1, LINE_GONE])
 @pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING])
 def test_on_a_line_that_is_gone_there_is_nothing_to_wait_for(
