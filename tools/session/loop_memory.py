@@ -95,7 +95,7 @@ class SharedBlock:
         return CycleMemory(
             self.constants, self.state, self.tables, self.sample, self.command, self.words, self.ring,
             self.histograms, np.zeros(2, np.int64),
-            Arm(self.arm_constants, self.links, new(ArmMotion, len(self.links) + 1)),
+            Arm(self.arm_constants, self.links, new(ArmMotion, len(self.links) + 1)) if len(self.links) else None,
         )  # fmt: skip
 
     def near(self) -> Near:
