@@ -22,7 +22,7 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import AxisConstants, AxisState
-from jointctl.firmware_py.schema import array_of, f8, i4, new, record
+from jointctl.firmware_py.schema import array_of, f8, i4, record
 from jointctl.firmware_py.states import AxisPhase
 
 BASE = -1  # parent of a link that hangs on no other
@@ -84,11 +84,6 @@ class Arm(NamedTuple):
     constants: np.ndarray  # ArmConstants[1]
     links: np.ndarray  # ArmLink[N]
     motion: np.ndarray  # ArmMotion[N + 1]; the last one is the base, where the index BASE finds it
-
-
-def no_arm() -> Arm:
-    """Of a joint, or joints, that no model connects."""
-    return Arm(new(ArmConstants), new(ArmLink, 0), new(ArmMotion))
 
 
 # --- Recursive Newton-Euler ---

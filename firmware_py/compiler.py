@@ -34,7 +34,7 @@ with _without("coverage", "yaml"):
     import numba
 import llvmlite.binding as llvm  # noqa: E402
 from llvmlite import ir  # noqa: E402
-from numba.core import caching, codegen  # noqa: E402
+from numba.core import caching, codegen, event  # noqa: E402
 from numba.core.compiler_lock import global_compiler_lock  # noqa: E402
 from numba.core.typing import typeof  # noqa: E402
 from numba.extending import register_jitable  # noqa: E402
@@ -69,6 +69,16 @@ def _index_that_can_be_read(file: Path) -> Any:
 _cache_file._load_index = _index_that_can_be_read
 
 
+@contextlib.contextmanager
+def _no_timer(_kind: str, _callback: object) -> Iterator[None]:
+    yield
+
+
+# A function ten calls deep has ten timers of numba's, each of which sees every entry of the compiler: 5 % of compiling.
+_events: Any = event
+_events.install_timer = _no_timer
+
+
 def _no_blas() -> None:
     raise ImportError("kernels have no linear algebra")
 
@@ -98,9 +108,6 @@ class _Library(_plain_library):  # type: ignore[misc]
         super().finalize()
 
     def _optimize_final_module(self) -> None:
-        # an address of this process keeps a function out of the cache: optimising tells whether it is used
-        if any(variable.name.startswith(_ADDRESSES) for variable in self._final_module.global_variables):
-            self._late = False
         if not self._late:
             super()._optimize_final_module()
 
@@ -117,12 +124,27 @@ class _Library(_plain_library):  # type: ignore[misc]
         if self._late:
             super()._optimize_final_module()
 
+    def _to_machine_code(self) -> None:
+        self._late = False
+        self._optimize_final_module()
+        self._finalize_final_module()
+
+    @property
+    def has_dynamic_globals(self) -> bool:
+        """Asked before a function is kept, which an address of this process forbids; optimising tells if it is used."""
+        if self._late and self._dynamic_globals:
+            self._dynamic_globals.clear()
+            self._to_machine_code()
+        return len(self._dynamic_globals) > 0
+
+    def holds_addresses(self) -> bool:
+        """Whether what `optimise` has left is of use in this process only."""
+        return any(variable.name.startswith(_ADDRESSES) for variable in self._final_module.global_variables)
+
     def get_pointer_to_function(self, name: str) -> int:
         self._ensure_finalized()
         if self._late and any(function.name == name for function in self.get_defined_functions()):
-            self._late = False
-            self._optimize_final_module()
-            self._finalize_final_module()
+            self._to_machine_code()
         return int(super().get_pointer_to_function(name))
 
     def serialize_using_object_code(self) -> tuple[str, str, object]:
@@ -179,7 +201,20 @@ OPTIONS: dict[str, Any] = {**MACHINE, "no_cpython_wrapper": True, "no_cfunc_wrap
 def dispatcher_of(function: Callable[..., Any], *, cache: bool, forceinline: bool) -> Any:
     """Numba's own for a function; it compiles for the types that it is called with by kernels."""
     compiler: Any = numba.njit
-    return compiler(**OPTIONS, cache=cache, **({"forceinline": True} if forceinline else {}))(function)
+    made: Any = compiler(**OPTIONS, cache=cache, **({"forceinline": True} if forceinline else {}))(function)
+    template = made.get_call_template
+
+    def template_for_any_value(args: Any, named: dict[str, Any]) -> Any:
+        return template(tuple(map(_for_any_value, args)), {name: _for_any_value(kind) for name, kind in named.items()})
+
+    # numba compiles a function anew for each literal and each size of integer that callers give it: a tenth of the time
+    made.get_call_template = template_for_any_value
+    return made
+
+
+def _for_any_value(kind: Any) -> Any:
+    general = types.unliteral(kind)
+    return types.int64 if isinstance(general, types.Integer) and general.signed else general
 
 
 def type_of_kernel(dispatcher: Any) -> Any:
@@ -337,6 +372,8 @@ def compiled(kernel: Kernel, arguments: tuple[Any, ...]) -> MachineCode:
         library.add_linking_library(made.library)
         library.finalize()
         library.optimise()
+        if library.holds_addresses():
+            raise TypeError(f"{kernel.__qualname__} holds an address of this process, and no other could run it")
         code = library._codegen._tm.emit_object(library._final_module)
     return MachineCode(_SYMBOL, slots.codes, description, code, stands_alone(code))
 

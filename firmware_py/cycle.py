@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.arm_model import Arm, feed_arm, no_arm
+from jointctl.firmware_py.arm_model import Arm, feed_arm
 from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.kernel import inlined, kernel, shared
 from jointctl.firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
@@ -48,9 +48,10 @@ class Word(IntEnum):
     LISTEN = 64  # the supervisor: what the bus says from now on is for the run
     ASLEEP_NS = 72  # CLOCK_BOOTTIME - CLOCK_MONOTONIC when the run began: how long the computer has been suspended
     HELD_UP_NS = 80  # how long the guard of a serial line saw the loop do nothing, when it switched the drive off
+    BUS = 88  # the supervisor: the bus is there, and may be opened
 
 
-WORDS = 88
+WORDS = 96
 LINE_WORDS = 8  # int64 in a cache line
 _RAMP = int(StopRequest.RAMP)
 SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
@@ -122,7 +123,7 @@ class CycleMemory(NamedTuple):
     ring: np.ndarray  # LogRecord[R]; record k is at k % R once HEAD > k
     histograms: np.ndarray  # int64[4, HISTOGRAM_BINS]
     timespec: np.ndarray  # int64[2]: scratch of the clock
-    arm: Arm = no_arm()  # that the axes are the joints of, in their order
+    arm: Arm | None = None  # that the axes are the joints of, in their order; None: nothing of arms is compiled
 
 
 class Exchange(NamedTuple):
@@ -299,6 +300,12 @@ def log_cycle(memory: CycleMemory, slot: Slot, waited_ns: int, end_ns: int) -> b
     return finished
 
 
+@kernel
+def _feed(arm: Arm | None, memory: CycleMemory) -> None:
+    if arm is not None:
+        feed_arm(arm, memory.constants, memory.state)
+
+
 @shared
 def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot) -> bool:
     """One cycle of every axis; True once every axis is FINISHED."""
@@ -332,8 +339,7 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
             together, all_enabled,
         )  # fmt: skip
     stop_others(memory.state, samples)
-    if len(memory.arm.links) > 0:
-        feed_arm(memory.arm, memory.constants, memory.state)
+    _feed(memory.arm, memory)
     for axis in range(len(memory.state)):
         command_axis(
             memory.constants[axis], memory.state[axis], memory.tables[axis], samples[axis], commands[axis],

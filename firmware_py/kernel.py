@@ -92,6 +92,14 @@ JIT_DISABLED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+
+class _Here(threading.local):
+    """Of each thread."""
+
+    interprets = False  # within what `plain` has made
+
+
+_here = _Here()
 _lock = threading.RLock()
 _shared: list[Callable[..., Any]] = []
 _told: list[Callable[[], object]] = []  # when something is compiled
@@ -135,6 +143,8 @@ class Kernel:
         return self.__qualname__
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if _here.interprets:
+            return self.py_func(*arguments, **named)
         numbers: list[Any] = []
         form: list[Any] = []
         for each in arguments:
@@ -242,8 +252,19 @@ def on_compiling(tell: Callable[[], object]) -> Iterator[None]:
 
 
 def plain(function: Function) -> Function:
-    """The Python function of a kernel: for a few calls outside the loop: loading the compiled one takes longer."""
-    return cast(Function, getattr(function, "py_func", function))
+    """A kernel, and all that it calls, as plain Python: for a few calls outside the loop, without the compiler."""
+    if not isinstance(function, Kernel):
+        return function
+
+    @functools.wraps(function.py_func)
+    def interpreted(*arguments: Any, **named: Any) -> Any:
+        before, _here.interprets = _here.interprets, True
+        try:
+            return function.py_func(*arguments, **named)
+        finally:
+            _here.interprets = before
+
+    return cast(Function, interpreted)
 
 
 def shared(function: Function) -> Function:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
-from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import SetPoint
 from jointctl.firmware_py.schema import new
@@ -538,7 +538,7 @@ def _quadratic_roots(a: float, b: float, c: float) -> list[float]:
 def approach_peak(position_rad: float, target_reference: Reference, duration_s: float) -> MotionPeak:
     """What the approach of `plan_approach` demands at most; it may swing back to gain the target's velocity."""
     coefficients = np.zeros(6)
-    plan_approach(position_rad, target_reference, duration_s, coefficients)
+    plain(plan_approach)(position_rad, target_reference, duration_s, coefficients)
     position = np.polynomial.Polynomial(coefficients)
     c3, c4, c5 = (float(value) for value in coefficients[3:])
     ends = [0.0, duration_s]
@@ -595,5 +595,5 @@ def approach_duration_s(
 def approach_start(constants: TrajectoryConstants, table: np.ndarray = NO_TABLE) -> Any:
     """A `Reference` record of the trajectory at t = 0, the target of an approach."""
     reference = new(Reference)[0]
-    reference_at(constants, table, 0, 0.0, reference)
+    plain(reference_at)(constants, table, 0, 0.0, reference)
     return reference

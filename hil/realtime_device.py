@@ -72,7 +72,7 @@ class DeviceMemory(NamedTuple):
     plant_constants: Any  # PlantConstants[N]
     plant_states: Any  # PlantState[N]
     queues: Any  # FrameQueue[N], to the bus
-    arm: ArmPlant  # through which the joints of several drives move one another
+    arm: Any  # ArmPlant of several drives; None = a single joint, and nothing of arms is compiled
     faults: Any  # FaultConstants[N, M], see `hil.faults`; None = none, and nothing of them is compiled
     fault_memories: Any  # FaultMemory[N]
     bus: np.ndarray  # int64[N]: of each drive the first one on the same bus
@@ -181,8 +181,11 @@ def _wait_for_frames(of: DeviceMemory, service_fd: int, wait_ns: int) -> None:
 
 
 @kernel
-def _advance_all(of: DeviceMemory, until_ns: int) -> None:
-    advance_together(of.devices, of.plant_constants, of.plant_states, until_ns, of.queues, of.arm)
+def _advance_all(of: DeviceMemory, arm: Any, until_ns: int) -> None:
+    if arm is None:
+        advance(of.devices[0], of.plant_constants[0], of.plant_states[0], until_ns, of.queues[0])
+    else:
+        advance_together(of.devices, of.plant_constants, of.plant_states, until_ns, of.queues, arm)
 
 
 @kernel
@@ -213,7 +216,7 @@ def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, bus: int, now
                 of.plant_states[index], sent_ns,
             )  # fmt: skip
     if len(of.devices) > 1:  # a single joint moves on when it takes the frame
-        _advance_all(of, sent_ns)
+        _advance_all(of, of.arm, sent_ns)
     for index in range(bus, len(of.devices)):
         if of.bus[index] != bus:
             continue
@@ -243,7 +246,7 @@ def _take_sdo_answer(of: DeviceMemory, now_ns: int) -> None:
         device = of.devices[index]
         if of.bus[index] == bus and (node_id == device.node_id or node_id == device.encoder.node_id):
             device.next_due_ns = 0
-            _advance_all(of, now_ns)
+            _advance_all(of, of.arm, now_ns)
             append_frame(of.queues[index], frame)
 
 
@@ -303,7 +306,7 @@ def run_device(service_fd: int, of: DeviceMemory) -> int:
             _flush_all(faults, monotonic_ns(timespec), of)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
-            _advance_all(of, woken_ns - lag_ns)
+            _advance_all(of, of.arm, woken_ns - lag_ns)
             _flush_all(faults, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
@@ -339,8 +342,8 @@ class RealtimeDevice:
     def __init__(
         self, devices: Cia402Device | Sequence[Cia402Device], fd: int | Sequence[int], arm: ArmPlant | None = None
     ) -> None:
-        self._arm = no_arm_plant() if arm is None else arm
         self._devices = [devices] if isinstance(devices, Cia402Device) else list(devices)
+        self._arm = no_arm_plant() if arm is None and len(self._devices) > 1 else arm
         self.plant_states = self._devices[0].whole_row.plant_states
         fds = [fd] * len(self._devices) if isinstance(fd, int) else list(fd)
         self._fds, self._bus = np.array(fds), np.array([fds.index(one) for one in fds])

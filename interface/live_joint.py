@@ -145,9 +145,7 @@ class LiveMotor:
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
             display = others.beside(lambda _: self._display)
             self._session = Session(plan, self._approval, output, control, display, others.set_points)
-            if own is not None:
-                own.until_bus()
-                self._session.until_ready, self._session.private_bus = own.until_ready, True
+            self._session.own = own
             self._thread = threading.Thread(target=self._run, name="jointctl session")
             self._thread.start()
             for name in _NEEDED:  # commissioning waits for the drive most of the time

@@ -117,12 +117,12 @@ class OwnVirtualJoint:
         self._starting = Starting("the virtual joint", process, tell, BusError)
         self._said = b""
 
-    def until_bus(self) -> None:
-        """`BusError` if it ends, or hangs, before."""
-        self._until(BUS)
+    def until_bus(self, alive: Callable[[], None] = lambda: None) -> None:
+        """`alive` is called all the time and may raise.  `BusError` if it ends, or hangs, before."""
+        self._until(BUS, alive)
 
     def until_ready(self, alive: Callable[[], None] = lambda: None) -> None:
-        """Its drive answers; `alive` is called all the time and may raise.  `BusError` as above."""
+        """Its drive answers; `alive` and `BusError` as above."""
         self._until(DRIVE, alive)
 
     def _until(self, word: bytes, alive: Callable[[], None] = lambda: None) -> None:

@@ -19,7 +19,7 @@ from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.exchange import accept, begin, end, link_of
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.arm_model import Arm, no_arm
+from jointctl.firmware_py.arm_model import Arm
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.kernel import bound
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
@@ -137,7 +137,7 @@ def _memory(
     axes = len(state)
     return CycleMemory(
         constants, state, tables, new(Sample, axes), new(Command, axes), np.zeros(WORDS, np.int64), log,
-        np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64), no_arm() if arm is None else arm,
+        np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64), arm,
     )  # fmt: skip
 
 

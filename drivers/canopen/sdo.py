@@ -159,7 +159,7 @@ class ObjectAccess:
         if variable is None:
             raise DeviceError(
                 f"EDS {self._eds_name} has no object {object_name(index, sub)} ({what}), which jointctl needs",
-                hint="use the EDS file that belongs to this drive and firmware",
+                hint="if that is the file of this drive and firmware, jointctl cannot drive it (docs/drives)",
             )
         return variable
 

@@ -188,6 +188,7 @@ def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopT
     """The control loop for so long after it has settled; this process only gives its sign of life meanwhile."""
     config = joints_of(given)[0]
     with _loop(given) as loop, commissioned(given) as (drive, constants):
+        loop.bus_is_there()
         loop.wait_ready()
         drive.start_cyclic()
         loop.go(constants, drive.port())

@@ -50,6 +50,7 @@ from tests.bench.law_speed import (
     sine_inputs,
 )
 from tests.bench.paired import Row, compared, interleaved, measured, outcome_data, outcome_table, skipped, write_outcome
+from tests.places import ROOT
 from tests.sessions import constants_of
 
 
@@ -247,3 +248,22 @@ def test_an_error_is_one_line_and_an_exit_code(capsys: pytest.CaptureFixture[str
     assert shown.out == ""
     assert "only (=lop)" in shown.err
     assert "Traceback" not in shown.err
+
+
+def test_the_page_has_one_table_of_twelve_rows_and_each_figure_is_in_the_data():
+    page = (ROOT / "docs" / "benchmarks.md").read_text().splitlines()
+    data = json.loads((ROOT / "docs" / "benchmarks.json").read_text())
+    measured_ones = {f"{row['ours']:.3g} {row['unit']}".strip() for row in data["rows"] if row["ours"] is not None}
+    ratios = {
+        f"{row['ratio']:.3g} ({row['low']:.3g}..{row['high']:.3g})" for row in data["rows"] if row["ratio"] is not None
+    }
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in page if line.startswith("| ")][1:]
+    assert len(table) == 12
+    assert len(page) <= 80
+    assert [row for row in table if row[1] not in measured_ones] == []
+    assert [row for row in table if row[4] and row[4] not in ratios] == []
+    assert all(row["reached"] for row in data["rows"] if row["goal"] is not None)
+    for other in data["others"]:
+        assert other["what"]
+        assert other["conditions"]
+        assert other["rows"]

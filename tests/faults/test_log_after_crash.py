@@ -75,6 +75,7 @@ def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_
         drive = CanopenSession().open(config)
         try:
             report = drive.commission()
+            loop.bus_is_there()
             loop.wait_ready()
             drive.start_cyclic()
             loop.go(constants_of(config, start_position_rad=report.start_position_rad), drive.port())

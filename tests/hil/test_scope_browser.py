@@ -521,3 +521,23 @@ def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: 
     assert int(records.fault.max()) == Fault.NONE
     assert records.trajectory_s[records.phase == AxisPhase.TRACKING][-1] > 16.0
     assert stalled_supervisor_kB - before_supervisor_kB < 40_000, (before_supervisor_kB, stalled_supervisor_kB)
+
+
+def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(bench: Any, browser: Browser) -> None:
+    """The page's library would keep it, and send it when the page has its connection again."""
+    _scope, tab, _url = opened(bench, browser)
+    tab.click("clear")
+    tab.until("!document.querySelector('[data-testid=\"start\"]').disabled")
+    tab.js("void window.socket.disconnect()")
+    tab.click("start")
+    tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('NOT CONNECTED')")
+    tab.js("void window.socket.connect()")
+    tab.until("window.socket.connected")
+    time.sleep(3.0)
+    state_is(tab, "ready; nothing moves", 5.0)
+    assert bench.is_pre_operational()
+    start(tab)
+    tab.js("void window.socket.disconnect()")
+    tab.click("stop")  # a request of its own
+    tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP taken')")
+    assert bench.disabled()

@@ -301,7 +301,7 @@ class _Rows:
 
     def filtered(self, error: Array, first: int, cutoff_Hz: float, period_s: float) -> Array:
         """Rate of an error in this period [rad/s]; the states from `first` on are the last error and rate."""
-        gain = low_pass_gain(cutoff_Hz, period_s)
+        gain = plain(low_pass_gain)(cutoff_Hz, period_s)
         return (1.0 - gain) * self.state(first + 1) + gain / period_s * (error - self.state(first))
 
     def rate(self, settings: LoopSettings) -> Array:

@@ -250,7 +250,7 @@ def _fill_flexible(record: FlexibleConstants, config: Config, reducer: Reducer) 
 def _fill_velocity(record: VelocityConstants, config: Config, cutoff_Hz: float) -> None:
     record.period_s = period_s(config)
     record.cutoff_Hz = cutoff_Hz
-    record.period_gain = low_pass_gain(cutoff_Hz, period_s(config))
+    record.period_gain = plain(low_pass_gain)(cutoff_Hz, period_s(config))
 
 
 def encoders_of_law(config: Config) -> Encoders:
@@ -269,8 +269,8 @@ def hidden_layer(control: Control) -> tuple[tuple[tuple[float, float], ...], tup
 def fill_change(record: ChangeConstants, law: LawConstants, config: Config) -> None:
     """The room for changes while the joint moves; moves are as quick as an automatic approach."""
     factor = config.live.gain_factor
-    gains_of(law, record.low)
-    gains_of(law, record.high)
+    for gains in (record.low, record.high):
+        plain(gains_of)(law, gains)
     for name in dtype_of(Gains).names or ():
         setattr(record.low, name, getattr(record.low, name) / factor)
         setattr(record.high, name, getattr(record.high, name) * factor)

@@ -28,6 +28,7 @@ STOP_PATH = "/stop"
 ANSWER_s = 2.0
 STALE_s = 3.0
 NOT_TAKEN = "STOP DID NOT ARRIVE: Ctrl-C in the terminal, jointctl stop, or the emergency stop"
+CUT_OFF = "NOT CONNECTED: this page sends nothing but STOP"
 STOP_KEYS = "Escape or space, from anywhere"
 STALE = "no news: what this page shows is old, and the joint may move"
 
@@ -41,11 +42,25 @@ _PRESSED = """window.jointctlStop = () => {
     .catch(() => tell('NOT_TAKEN', true))
 }"""
 
+# What is pressed while the page is cut off, its library would send later, when no one expects it: it is refused.
 # Escape always; space too while the joint is under control, also from a field or a focused button: nothing there needs
 # it then.  A key that is held down is one press.
 _WATCH = """<script>
 PRESSED
 const isSpace = event => event.key === ' ' || event.code === 'Space'
+const byName = name => document.querySelector(`[data-testid="${name}"]`)
+const refuse = event => {
+  const beat = byName('beat'), stale = byName('stale'), word = byName('stop-word')
+  if (!beat || !stale || !word || beat.textContent.endsWith('OVER')) return
+  if (window.socket?.connected && stale.style.display === 'none') return
+  if (event.target.closest?.('[data-testid="stop"]') || (event.type === 'keydown' && event.key !== 'Enter')) return
+  event.preventDefault()
+  event.stopImmediatePropagation()
+  word.textContent = 'CUT_OFF'
+  word.style.color = '#c62828'
+  setTimeout(() => { if (word.textContent === 'CUT_OFF') word.textContent = '' }, 8000)
+}
+for (const kind of ['click', 'keydown']) document.addEventListener(kind, refuse, true)
 document.addEventListener('keydown', event => {
   const beat = document.querySelector('[data-testid="beat"]')
   const moves = beat && beat.textContent.endsWith('MOVES')
@@ -84,7 +99,9 @@ class StopButton:
     def __init__(self) -> None:
         pressed = _PRESSED.replace("STOP_PATH", STOP_PATH).replace("NOT_TAKEN", NOT_TAKEN)
         pressed = pressed.replace("ANSWER_MS", f"{ANSWER_s * 1e3:.0f}")
-        ui.add_body_html(_WATCH.replace("PRESSED", pressed).replace("STALE_MS", f"{STALE_s * 1e3:.0f}"))
+        ui.add_body_html(
+            _WATCH.replace("CUT_OFF", CUT_OFF).replace("PRESSED", pressed).replace("STALE_MS", f"{STALE_s * 1e3:.0f}")
+        )
         with ui.column().classes("items-end gap-1 shrink-0"):
             button = ui.button("STOP", color="red-8").on("click", js_handler="() => window.jointctlStop()")
             button.classes("text-3xl font-bold px-14 py-3")

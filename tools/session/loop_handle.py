@@ -16,6 +16,7 @@ import numpy as np
 
 from jointctl.drivers.errors import MotionFault
 from jointctl.firmware_py.cycle import Word
+from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
@@ -109,6 +110,10 @@ class LoopHandle:
         part.block = self.block.of_axis(axis)
         return part
 
+    def bus_is_there(self) -> None:
+        """The loop may open the bus, once it is compiled."""
+        self.block.words[Word.BUS] = 1
+
     def wait_ready(
         self, alive: Callable[[], object] = lambda: None, tell: Callable[[str], None] = lambda _: None
     ) -> None:
@@ -131,7 +136,7 @@ class LoopHandle:
         self.block.constants[:] = constants
         self.block.port[:] = port
         for axis in range(self.block.axes):
-            reset_axis(self.block.constants[axis], self.block.state[axis])
+            plain(reset_axis)(self.block.constants[axis], self.block.state[axis])
         self.beat()
         now_ns = time.monotonic_ns()
         self.block.words[Word.ASLEEP_NS] = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - now_ns

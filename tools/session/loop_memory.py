@@ -98,7 +98,7 @@ class SharedBlock:
         return CycleMemory(
             self.constants, self.state, self.tables, self.sample, self.command, self.words, self.ring,
             self.histograms, np.zeros(2, np.int64),
-            Arm(self.arm_constants, self.links, self.motion),
+            Arm(self.arm_constants, self.links, self.motion) if len(self.links) else None,
         )  # fmt: skip
 
     def near(self) -> Near:

@@ -10,13 +10,15 @@ import gc
 import os
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from jointctl.firmware_py.cycle import Exchange
+from jointctl.drivers.errors import BusError
+from jointctl.firmware_py.cycle import Exchange, Word
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 
 FOREVER = 1 << 62
+_POLL_S = 0.001
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,10 @@ def compiled_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
 
     call = compiled_call(block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
+    while block.words[Word.BUS] == 0:
+        if os.getppid() != order.supervisor_pid:
+            raise BusError("the supervising process went before the bus was there")
+        time.sleep(_POLL_S)
     with contextlib.ExitStack() as stack:
         ends = {
             axis: stack.enter_context(open_cyclic_end(interface, channel))

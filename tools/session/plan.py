@@ -18,11 +18,11 @@ import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import BusError, JointctlError, MotionFault, UsageError
-from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
+from jointctl.firmware_py.trajectory import approach_start, peak_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import (
     axis_constants,
@@ -297,8 +297,7 @@ class ConfiguredMotion:
         """Lines that say where the joint will go, how fast, with how much torque, for how long."""
         config = self.config
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
-        first = new(Reference)[0]
-        reference_at(axis.trajectory, self.table, 0, 0.0, first)
+        first = approach_start(axis.trajectory, self.table)
         approach = float(axis.sequence.approach_s)
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"

@@ -20,6 +20,7 @@ from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Driv
 from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.tools.child_process import OwnVirtualJoint
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
@@ -88,9 +89,7 @@ class Session:
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
         self.loop: LoopHandle | None = None  # once it has been started
-        self.private_bus = False  # see `SessionDrive.open`
-        # Waits for drives that are still starting, beside the loop and the listening; the argument may end it.
-        self.until_ready: Callable[[Callable[[], None]], None] = lambda alive: None
+        self.own: OwnVirtualJoint | None = None  # which may still be starting, on a bus of this program alone
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
@@ -100,6 +99,7 @@ class Session:
         with (
             signals.held(),
             self._loop(tail_path) as loop,
+            self._bus_there(loop),
             self._buses() as looking_on,
             self._kind.kept_awake(self._output),
         ):
@@ -108,7 +108,8 @@ class Session:
             guard: Guard | None = None
             try:
                 guard = self._kind.guard(config, loop)
-                self.until_ready(signals.leave_if_asked)
+                if self.own is not None:  # its drive starts beside the loop and the listening
+                    self.own.until_ready(signals.leave_if_asked)
                 try:
                     reports = self.commissioned(config, drives, self._may_brake())
                 except Declined:
@@ -143,6 +144,13 @@ class Session:
         return LoopHandle(self._config, plan.tables, port, tail_path, marker_fds, model, plan.configs)
 
     @contextlib.contextmanager
+    def _bus_there(self, loop: LoopHandle) -> Iterator[None]:
+        if self.own is not None:  # what compiles the loop is there long before the bus is
+            self.own.until_bus(self.signals.leave_if_asked)
+        loop.bus_is_there()
+        yield
+
+    @contextlib.contextmanager
     def _buses(self) -> Iterator[dict[int, tuple[BusWatch, FrameRecorder | None]]]:
         """Who looks on at each bus, by the number of the first joint on it."""
         with contextlib.ExitStack() as stack:
@@ -155,7 +163,7 @@ class Session:
 
     def _opened(self) -> DriveGroup:
         """The drives of all joints, nothing sent to them yet."""
-        return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked, self.private_bus)
+        return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked, self.own is not None)
 
     def _made_safe(self, drives: DriveGroup) -> str:
         states = drives.make_safe(asked=bool(self.signals.commanded_ns))

@@ -68,7 +68,6 @@ def tracked(
     from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
-    from jointctl.tools.session.set_points import load_check
 
     if not (assume_yes or dry_run):
         require_terminal()
@@ -82,10 +81,7 @@ def tracked(
         session = Session(
             plan, others.consent(consent, output), output, control, others.beside(display), others.set_points
         )
-        if own is not None:
-            load_check()  # the first kernel loads much of numba: while the bus is not there yet
-            own.until_bus()
-            session.until_ready, session.private_bus = own.until_ready, True
+        session.own = own
         try:
             result = session.run()
         except KeyboardInterrupt:

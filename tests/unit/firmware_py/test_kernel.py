@@ -20,11 +20,11 @@ import numba
 import numpy as np
 import pytest
 from numba.core import caching
-from numba.core.errors import NumbaError
+from numba.core.errors import NumbaError, NumbaWarning
 
 from jointctl.firmware_py import compiler, machine_code
 from jointctl.firmware_py import kernel as kernel_module
-from jointctl.firmware_py.kernel import Kernel, kernel, source_hash
+from jointctl.firmware_py.kernel import Kernel, kernel, plain, source_hash
 from jointctl.firmware_py.machine_code import MachineCode, Result
 from jointctl.firmware_py.schema import array_of, f8, i4, new, record
 from tests.places import ROOT
@@ -51,6 +51,64 @@ def test_the_finite_check_is_not_optimised_away(value: float, finite: bool) -> N
 def test_a_division_by_zero_does_not_unwind_the_loop() -> None:
     assert divide(1.0, 0.0) == math.inf
     assert math.isnan(divide(0.0, 0.0))
+
+
+@kernel
+def _shifted(value: int, by: int, doubled: bool) -> int:
+    return 2 * (value + by) if doubled else value + by
+
+
+@kernel
+def _shifted_often(values: np.ndarray) -> int:
+    return _shifted(values[0], 1, True) + _shifted(values[1], 2, False) + _shifted(values[0], values[1], True)
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
+def test_a_kernel_is_compiled_once_for_all_literals_and_integers_of_its_callers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kernel_module, "cache_folder", None)  # from which it would not be compiled at all
+    assert _shifted_often(np.array([3, 4], np.int32)) == 8 + 6 + 14
+    assert isinstance(_shifted, Kernel)
+    (signature,) = _shifted.dispatcher_for().overloads
+    assert [str(kind) for kind in signature] == ["int64", "int64", "bool"]
+
+
+@kernel
+def _half(value: float) -> float:
+    return 0.5 * value
+
+
+@kernel
+def _quarter(value: float) -> float:
+    return _half(_half(value))
+
+
+def test_a_plain_kernel_is_compiled_nowhere_within_and_afterwards_as_ever() -> None:
+    assert plain(_quarter)(6.0) == 1.5
+    if not kernel_module.JIT_DISABLED:
+        assert (_quarter.loaded, _half.loaded) == (0, 0)
+        with pytest.raises(TypeError):
+            plain(_quarter)("not a number")
+        assert _quarter(6.0) == 1.5
+        assert (_quarter.loaded, _half.loaded) == (1, 0)
+
+
+_LARGE = np.arange(400_000.0)  # numba takes a constant so large by its address
+
+
+@kernel
+def _of_large(index: int) -> float:
+    return _LARGE[index]
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
+def test_machine_code_with_an_address_of_this_process_is_never_kept() -> None:
+    with (
+        pytest.warns(NumbaWarning, match="dynamic globals"),
+        pytest.raises(TypeError, match="holds an address of this"),
+    ):
+        _of_large(3)
 
 
 def test_options() -> None:
@@ -301,7 +359,7 @@ def test_what_the_loop_and_the_virtual_joint_run_stands_alone() -> None:
     total(np.arange(3.0))
     kept = [machine_code.read(path) for path in kernel_module.cache_folder.glob("*.entry")]
     assert kept
-    assert all(code is not None and code.alone for code in kept)
+    assert all(code is not None and machine_code.stands_alone(code.object_code) for code in kept)
     code = next(code for code in kept if code is not None)
     assert machine_code.unresolved(code.object_code) is not None
     assert machine_code.unresolved(b"MZ") is None

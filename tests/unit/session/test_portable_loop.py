@@ -9,13 +9,14 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import can
 import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.firmware_py import cycle
 from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.sequence import reset_axis
@@ -365,10 +366,37 @@ def test_the_process_ends_with_one_line(
     monkeypatch.setattr(loop_process, "_block_signals", lambda: None)
     monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
     monkeypatch.setattr(sys, "argv", ["loop", order(interface, period_ns, block)])
+    block.words[Word.BUS] = 1
     assert loop_process.main() == code
     lines = capsys.readouterr().err.splitlines()
     assert text in lines[-1]
     assert sum("plain Python loop over" in line for line in lines[:-1]) == len(lines) - 1
+
+
+def test_the_bus_is_opened_when_the_supervisor_has_it_and_not_before(
+    block: SharedBlock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        block.words[Word.BUS] = len(waits) == 3
+
+    monkeypatch.setattr(loops.time, "sleep", wait)
+    given = replace(LoopOrder(**json.loads(order("jointctl", 1_000_000, block))), supervisor_pid=os.getppid())
+    with pytest.raises(BusError, match="no virtual bus at"), loops.compiled_loop(given, block):
+        pass
+    assert len(waits) == 3
+
+
+def test_a_loop_whose_supervisor_goes_before_the_bus_is_there_ends(
+    block: SharedBlock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
+    given = replace(LoopOrder(**json.loads(order("jointctl", 1_000_000, block))), supervisor_pid=-1)
+    with pytest.raises(BusError, match="before the bus was there"), loops.compiled_loop(given, block):
+        pass
 
 
 def test_an_unexpected_exception_is_one_line_too(
