@@ -56,7 +56,7 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in ("COLUMNS", "LINES"):  # readline gives them to processes that a test process starts
         os.environ.pop(name, None)
-    gc.set_threshold(100_000, 50, 100)  # as the command has it: a tenth of the tests' time
+    gc.set_threshold(50_000, 20, 10)  # a tenth of the time of tests went into it
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 
 

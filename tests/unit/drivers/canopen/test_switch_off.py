@@ -385,6 +385,7 @@ class NoLoop:
         return self
 
     def __exit__(self, *_: object) -> None: ...
+    def bus_is_there(self) -> None: ...
 
 
 def left_by_a_dry_run(monkeypatch: pytest.MonkeyPatch, config: Any, state: str) -> int:
