@@ -33,7 +33,6 @@ RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message; of recor
 REQUESTS = 16  # of viewers, at most between two looks
 AT_ONCE = 64  # messages of a server that are read in one look: it must not hold the supervisor up
 PIECE = 64  # records a message; less than the buffer of the socket
-STATES_S = 0.1  # between two messages of a feed of states
 COUNT_AGAIN_S = 2.0  # how often the server tells the number of open pages, changed or not
 SILENT_S = 3.0 * COUNT_AGAIN_S  # without that word nobody is there: the server hangs, and STOP with it
 SERVER_SILENT = (
@@ -93,8 +92,9 @@ class ScopeFeed:
 
     `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
     page has been open for so long; None = it goes on.  In any case it is reported in the terminal and the log.
-    `takes`: the kinds of requests that are passed on besides STOP; None = all.  `states`: of each hundredth of a second
-    only the first record is passed on, `STATES_S` together: each message wakes server and clients, beside the loop.
+    `takes`: the kinds of requests that are passed on besides STOP; None = all.  `states_s`: of each hundredth of a
+    second only the first record is passed on, those of so long together: each message wakes server and clients, beside
+    the loop.
     """
 
     def __init__(
@@ -105,9 +105,9 @@ class ScopeFeed:
         unwatched_s: float | None = None,
         server: str = SCOPE,
         takes: frozenset[str] | None = None,
-        states: bool = False,
+        states_s: float | None = None,
     ) -> None:
-        self._end, self._server, self._takes, self._states = end, server, takes, states
+        self._end, self._server, self._takes, self._states_s = end, server, takes, states_s
         self._held: dict[int, tuple[StateCycles, list[Any]]] = {}  # of each joint what goes with the next message
         self._next_s = 0.0
         end.setblocking(False)
@@ -137,13 +137,13 @@ class ScopeFeed:
 
     def show(self, snapshot: Snapshot) -> None:
         shown: dict[str, Any] = {"temperature_degC": snapshot.temperature_degC}
-        if self._states:
+        if self._states_s is not None:
             shown["skipped"] = snapshot.skipped  # a server of all records counts them
         if snapshot.axis == 0 and shown != self._told:
             self._told = shown
             self.settings(shown)
-        if self._states:
-            self._hold(snapshot)
+        if self._states_s is not None:
+            self._hold(snapshot, self._states_s)
         else:
             self._send_records(snapshot.axis, snapshot.records)
 
@@ -151,11 +151,11 @@ class ScopeFeed:
         for at in range(0, len(records), PIECE):
             self.send(RECORDS, bytes([axis]) + records[at : at + PIECE].tobytes())
 
-    def _hold(self, snapshot: Snapshot) -> None:
+    def _hold(self, snapshot: Snapshot, states_s: float) -> None:
         cycles, held = self._held.setdefault(snapshot.axis, (StateCycles(), []))
         held.append(cycles.take(snapshot.records)[:, 0])
         if snapshot.axis == 0 and (now_s := time.monotonic()) >= self._next_s:
-            self._next_s = max(self._next_s + STATES_S, now_s)
+            self._next_s = max(self._next_s + states_s, now_s)
             self._let_go()
 
     def _let_go(self) -> None:

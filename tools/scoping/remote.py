@@ -59,10 +59,11 @@ class _Kind:
     package: str  # that it needs
     extra: str  # that brings it
     takes: frozenset[str]
+    states_s: float  # between two messages to it: seldom for eyes, often for other programs
 
 
-FOXGLOVE = _Kind("Foxglove", "foxglove_server", "foxglove", "foxglove", frozenset({"gains"}))
-ROS2 = _Kind("ROS 2", "ros2_server", "zenoh", "ros2", frozenset({"enable"}))
+FOXGLOVE = _Kind("Foxglove", "foxglove_server", "foxglove", "foxglove", frozenset({"gains"}), 0.1)
+ROS2 = _Kind("ROS 2", "ros2_server", "zenoh", "ros2", frozenset({"enable"}), 0.05)
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ def _served(kind: _Kind, order: RemoteOrder, sources: SetPointSources | None) ->
     with server_process(f"jointctl.tools.scoping.{kind.module}", order, [feeds_end, points_end], [feed, points]):
         _wait_ready(kind, feed)
         _Channel(points, sources or SetPointSources("no one: --allow-remote was not given")).start()
-        yield ScopeFeed(feed, server=kind.name, takes=takes, states=True)
+        yield ScopeFeed(feed, server=kind.name, takes=takes, states_s=kind.states_s)
 
 
 def _wait_ready(kind: _Kind, feed: socket.socket) -> None:

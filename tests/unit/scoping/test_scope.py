@@ -185,7 +185,7 @@ def test_records_and_events_arrive_as_they_were(ends: tuple[socket.socket, socke
 def test_a_feed_of_states_passes_on_few_records_in_few_messages_and_all_in_the_end(
     ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock, feed = Clock(monkeypatch), ScopeFeed(ends[0], states=True)
+    clock, feed = Clock(monkeypatch), ScopeFeed(ends[0], states_s=0.1)
     looks = 25
     with feed:
         for look in range(looks):
@@ -201,7 +201,7 @@ def test_a_feed_of_states_passes_on_few_records_in_few_messages_and_all_in_the_e
         bodies = [found[2:] for found in messages if found[:1] == RECORDS and found[1] == axis]
         cycles = np.frombuffer(b"".join(bodies), dtype_of(LogRecord))["cycle"]
         np.testing.assert_array_equal(cycles, np.arange(0, 20 * looks, 10))
-        assert len(bodies) <= looks * 0.02 / feed_module.STATES_S + 2
+        assert len(bodies) <= looks * 0.02 / 0.1 + 2
 
 
 def test_the_last_stage_arrives_also_where_the_server_is_slow(ends: tuple[socket.socket, socket.socket]) -> None:
