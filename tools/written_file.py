@@ -30,9 +30,11 @@ def file_stems(names: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
     """Of files named after these, all different, whatever the file system thinks of capitals."""
     found: list[str] = []
     for name in names:
-        stem = re.sub(r"[^\w.-]+", "_", name).strip(".")[:_LONGEST_STEM] or "joint"
+        first = stem = re.sub(r"[^\w.-]+", "_", name)[:_LONGEST_STEM].strip(".") or "joint"
+        number = 1
         while stem.lower() in {*taken, *map(str.lower, found)}:
-            stem += "_joint"
+            number += 1
+            stem = f"{first[: _LONGEST_STEM - len(str(number)) - 1]}_{number}"
         found.append(stem)
     return found
 

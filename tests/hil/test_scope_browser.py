@@ -21,6 +21,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.verbs.scope import START_LATE_S
 from tests.browser import PROGRAM, Browser, Tab, free_port
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
@@ -523,6 +524,25 @@ def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: 
     assert stalled_supervisor_kB - before_supervisor_kB < 40_000, (before_supervisor_kB, stalled_supervisor_kB)
 
 
+@pytest.mark.parametrize("who", ["server", "supervisor"])
+def test_a_start_that_was_held_up_is_not_taken(bench: Any, browser: Browser, who: str) -> None:
+    """Its connection is there, but one of the two stands still; a later one starts."""
+    scope, tab, _url = opened(bench, browser)
+    pid = scope.child("jointctl.tools.scoping.server") if who == "server" else scope.process.pid
+    tab.click("clear")
+    tab.until("!document.querySelector('[data-testid=\"start\"]').disabled")
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        tab.click("start")
+        time.sleep(START_LATE_S + 1.0)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    tab.until("document.querySelector('[data-testid=\"late\"]').innerText.includes('press it again')")
+    state_is(tab, "ready; nothing moves", 5.0)
+    assert bench.is_pre_operational()
+    start(tab)
+
+
 def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(bench: Any, browser: Browser) -> None:
     """The page's library would keep it, and send it when the page has its connection again."""
     _scope, tab, _url = opened(bench, browser)
@@ -531,6 +551,9 @@ def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(
     tab.js("void window.socket.disconnect()")
     tab.click("start")
     tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('NOT CONNECTED')")
+    tab.js("document.querySelector('[data-testid=\"clear\"]').focus(); null")
+    press(tab, "Space")  # this would be sent later as well
+    assert tab.js("document.querySelector('[data-testid=\"clear\"]').getAttribute('aria-checked')") == "true"
     tab.js("void window.socket.connect()")
     tab.until("window.socket.connected")
     time.sleep(3.0)

@@ -180,7 +180,7 @@ class _Reader:
         if not name:
             self._problem(f"an element {tag} has no name")
         elif not name.isprintable():
-            self._problem(f"{tag} {name}: its name must have no control characters")
+            self._problem(f"{tag} {name}: its name must be of characters that can be printed")
         return name
 
     def _one(self, element: ElementTree.Element, tag: str, what: str) -> ElementTree.Element | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import time
 from collections.abc import Callable, Mapping
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from nicegui import ui
+from nicegui.events import GenericEventArguments
 
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.recording.run_log import Event
@@ -28,7 +30,7 @@ STOP_PATH = "/stop"
 ANSWER_s = 2.0
 STALE_s = 3.0
 NOT_TAKEN = "STOP DID NOT ARRIVE: Ctrl-C in the terminal, jointctl stop, or the emergency stop"
-CUT_OFF = "NOT CONNECTED: this page sends nothing but STOP"
+CUT_OFF = "NOT CONNECTED: not sent, now or later; STOP is tried all the same"
 STOP_KEYS = "Escape or space, from anywhere"
 STALE = "no news: what this page shows is old, and the joint may move"
 
@@ -53,14 +55,17 @@ const refuse = event => {
   const beat = byName('beat'), stale = byName('stale'), word = byName('stop-word')
   if (!beat || !stale || !word || beat.textContent.endsWith('OVER')) return
   if (window.socket?.connected && stale.style.display === 'none') return
-  if (event.target.closest?.('[data-testid="stop"]') || (event.type === 'keydown' && event.key !== 'Enter')) return
+  if (event.target.closest?.('[data-testid="stop"]')) return
+  // a space that goes down is STOP's, below; a tick takes the one that goes up
+  if (event.type !== 'click' && event.key !== 'Enter' && !(event.type === 'keyup' && isSpace(event))) return
   event.preventDefault()
   event.stopImmediatePropagation()
+  if (word.textContent === 'NOT_TAKEN') return  // the more important word
   word.textContent = 'CUT_OFF'
   word.style.color = '#c62828'
   setTimeout(() => { if (word.textContent === 'CUT_OFF') word.textContent = '' }, 8000)
 }
-for (const kind of ['click', 'keydown']) document.addEventListener(kind, refuse, true)
+for (const kind of ['click', 'keydown', 'keyup']) document.addEventListener(kind, refuse, true)
 document.addEventListener('keydown', event => {
   const beat = document.querySelector('[data-testid="beat"]')
   const moves = beat && beat.textContent.endsWith('MOVES')
@@ -100,7 +105,10 @@ class StopButton:
         pressed = _PRESSED.replace("STOP_PATH", STOP_PATH).replace("NOT_TAKEN", NOT_TAKEN)
         pressed = pressed.replace("ANSWER_MS", f"{ANSWER_s * 1e3:.0f}")
         ui.add_body_html(
-            _WATCH.replace("CUT_OFF", CUT_OFF).replace("PRESSED", pressed).replace("STALE_MS", f"{STALE_s * 1e3:.0f}")
+            _WATCH.replace("CUT_OFF", CUT_OFF)
+            .replace("PRESSED", pressed)
+            .replace("NOT_TAKEN", NOT_TAKEN)
+            .replace("STALE_MS", f"{STALE_s * 1e3:.0f}")
         )
         with ui.column().classes("items-end gap-1 shrink-0"):
             button = ui.button("STOP", color="red-8").on("click", js_handler="() => window.jointctlStop()")
@@ -125,6 +133,16 @@ def stale_mark() -> None:
 
 ENDED = "jointctl has ended"
 Ask = Callable[[str, dict[str, Any]], None]
+# what the browser knew when it was pressed, not the server when the press came
+_SEEN = """() => emit(document.querySelector('[data-testid="told-at"]').textContent)"""
+
+
+def _number_in(text: object) -> float:
+    """Of what a browser sent; without one -inf, long ago."""
+    try:
+        return float(str(text))
+    except ValueError:
+        return -math.inf
 
 
 class StartPanel:
@@ -142,19 +160,21 @@ class StartPanel:
             with ui.row().classes("items-center gap-6"):
                 self._clear = ui.checkbox("this range is clear, and I can reach the emergency stop")
                 self._clear.props('data-testid="clear"').on_value_change(self._on_tick)
-                self._start = ui.button("Start", on_click=self._on_start, color="green-9")
+                self._start = ui.button("Start", color="green-9").on("click", self._on_start, js_handler=_SEEN)
                 self._start.classes("text-lg px-8").props('no-caps data-testid="start"')
                 self._prepare = ui.button("Prepare the next run", on_click=lambda: ask("prepare", {}), color=None)
                 self._prepare.props('no-caps outline data-testid="prepare"')
+            self._late = ui.label("").style("color: #c62828; font-weight: 600").props('data-testid="late" role=alert')
+            self._at: Any = ui.label("").style("display: none").props('data-testid="told-at"')
         self._card.visible = False
 
     def _on_tick(self) -> None:
         self._start.enabled = bool(self._clear.value)
 
-    def _on_start(self) -> None:
-        """Only the very envelope that is shown is confirmed: its number goes along."""
+    def _on_start(self, event: GenericEventArguments) -> None:
+        """Only the very envelope that is shown is confirmed: its number goes along, and when the browser had it."""
         if self._clear.value and self._number is not None:
-            self._ask("start", {"number": self._number, "clear": True})
+            self._ask("start", {"number": self._number, "clear": True, "told_s": _number_in(event.args)})
 
     def show(self, settings: Mapping[str, Any]) -> None:
         """Follow the stage."""
@@ -163,6 +183,8 @@ class StartPanel:
         over = stage == OVER and bool(settings.get("lines"))
         self._card.visible = ready or over or stage in ("ended", "declined")
         number = settings.get("number")
+        self._late.text = str(settings.get("late", "")) if ready else ""
+        self._at.text = str(settings.get("told_s", ""))
         if ready and number != self._number:
             self._number = number
             self._clear.value = False
@@ -378,7 +400,7 @@ IDLE_SHARE = 3.0  # drawing leaves at least so many times its own duration to ev
 SLOW = 5  # every so many refreshes the texts are renewed
 STATISTICS_s = 10.0
 SHOWN_EVENTS = 8
-SILENT_s = 2.0  # a run tells something 50 times a second
+SILENT_s = {"running": 2.0, "ready": 4.0}  # a run tells something 50 times a second, a question is told once a second
 CSS = (
     ".q-field__label{font-size:13px} body{font-size:14px} .nicegui-content{padding:0 14px 10px; gap:8px}"
     " .scope-head{position:sticky; top:0; z-index:10; background:#fff; padding:10px 0 4px}"
@@ -497,11 +519,12 @@ class ScopePage:
         words = [STAGES[stage]] if stage in STAGES else self._words(rows, stage) if len(rows) else []
         if stage == OVER:
             words.append(ENDED)
-        self._state.text = " · ".join(words) or "waiting for the run"
         silent_s = time.monotonic() - self._history.heard_s
-        if stage == "running" and not self._history.ended and silent_s > SILENT_s:
-            words.append(f"NO NEWS FROM THE RUN for {silent_s:.0f} s")
-        bad = (fault and stage not in STAGES) or (silent_s > SILENT_s and stage == "running")
+        silent = silent_s > SILENT_s.get(stage, math.inf)
+        if silent and not self._history.ended:
+            words.append(f"NO NEWS FROM jointctl for {silent_s:.0f} s")
+        self._state.text = " · ".join(words) or "waiting for the run"
+        bad = silent or (fault and stage not in STAGES)
         self._state.classes(add="scope-bad" if bad else "", remove="" if bad else "scope-bad")
         if len(rows):
             lines = [f"{name:13}{text}" for name, text in percentiles_us(rows).items()]

@@ -27,6 +27,7 @@ def report(
     """One self-contained page about a run, or about several beside each other."""
     from jointctl.tools.recording.report_page import check_target, page, write_page
     from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.written_file import file_stems
 
     if not 1 <= len(paths) <= MOST_LOGS:
         raise DataError(f"number of logs (={len(paths)}) must be in [1..{MOST_LOGS}]")
@@ -37,7 +38,7 @@ def report(
         if len(log.records) < 2:
             raise DataError(f"{path}: nothing to report, the run has {len(log.records)} records")
     names = of_one_arm(logs)
-    title = f"{paths[0].stem.removesuffix(f'.{names[0]}')}: {', '.join(names)}" if names else ""
+    title = f"{paths[0].stem.removesuffix(f'.{file_stems(names[:1])[0]}')}: {', '.join(names)}" if names else ""
     title, names = title or " and ".join(log_names(paths)), names or log_names(paths)
     html = page(title, report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
     write_page(target, html, paths)
@@ -52,10 +53,12 @@ def log_names(paths: Sequence[Path]) -> list[str]:
 
 
 def of_one_arm(logs: Sequence[RunLog]) -> list[str]:
-    """The joints' names where all are different joints of one arm; else empty."""
+    """The joints' names where all are different joints of one arm in one run; else empty."""
     arms = [log.metadata.get("arm", {}) for log in logs]
     names = [arm.get("joint", "") for arm in arms]
-    same = len({arm.get("configuration") for arm in arms}) == 1
+    times_ns = [log.records["time_ns"][[0, -1]] for log in logs]
+    at_once = max(first for first, _ in times_ns) < min(last for _, last in times_ns)
+    same = len({arm.get("configuration") for arm in arms}) == 1 and at_once
     return names if len(logs) > 1 and all(names) and len(set(names)) == len(names) and same else []
 
 

@@ -45,6 +45,7 @@ from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.session.session import Session
 from jointctl.tools.verbs import scope as scope_module
+from jointctl.tools.verbs.scope import START_LATE_S
 from tests.sessions import constants_of
 
 
@@ -204,7 +205,9 @@ def test_a_feed_of_states_passes_on_few_records_in_few_messages_and_all_in_the_e
         assert len(bodies) <= looks * 0.02 / 0.1 + 2
 
 
-def test_the_last_stage_arrives_also_where_the_server_is_slow(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_the_last_stage_arrives_also_where_the_server_is_slow(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Otherwise its pages would go on to say that the joint may move."""
     feed = ScopeFeed(ends[0])
     while not feed.dropped:
@@ -216,6 +219,7 @@ def test_the_last_stage_arrives_also_where_the_server_is_slow(ends: tuple[socket
         while b"over" not in (found or [b""])[-1]:
             found.append(ends[1].recv(1 << 20))
 
+    monkeypatch.setattr(feed_module, "LAST_WORD_S", 60.0)  # however long this computer stands still
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
     feed.over()
@@ -692,13 +696,46 @@ class Feed:
     def requests(self) -> list[ViewerRequest]:
         last = self.told[-1]
         if last["stage"] == "ready":
-            return [ViewerRequest("start", "a viewer", {"number": last["number"], "clear": True})]
+            return [
+                ViewerRequest(
+                    "start", "a viewer", {name: last[name] for name in ("number", "told_s")} | {"clear": True}
+                )
+            ]
         if self.told.count(last) < 3:
             return []
         self.pressed()
         return [ViewerRequest("prepare", "a viewer", {})]
 
     def pressed(self) -> None: ...
+
+
+@pytest.mark.parametrize(("late_s", "taken"), [(START_LATE_S - 0.5, True), (START_LATE_S + 0.5, False), (None, False)])
+def test_a_start_that_was_held_up_is_not_taken_and_one_after_it_is(
+    monkeypatch: pytest.MonkeyPatch, late_s: float | None, taken: bool
+) -> None:
+    """By the last word that the browser had; a page that says none has seen none."""
+    clock = SimpleNamespace(now_s=100.0)
+    pressed: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        clock.now_s += seconds
+
+    class Held(Feed):
+        def requests(self) -> list[ViewerRequest]:
+            last = self.told[-1] if self.told else {}
+            if not last or clock.now_s < 101.0:
+                return []
+            pressed.append(clock.now_s)
+            told_s = last["told_s"]  # the second press comes at once
+            if len(pressed) == 1:
+                told_s = clock.now_s - late_s if late_s is not None else None
+            return [ViewerRequest("start", "a viewer", {"number": last["number"], "clear": True, "told_s": told_s})]
+
+    monkeypatch.setattr(scope_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=sleep))
+    feed: Any = Held()
+    assert scope_module.confirmed(feed, ["moves"])
+    assert len(pressed) == (1 if taken else 2)
+    assert any("late" in found["late"] for found in feed.told) is not taken
 
 
 @pytest.mark.parametrize("refused", [True, False])

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -25,6 +27,7 @@ from jointctl.tools.session import elmo_drive as module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.loop_process import slow_start
+from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from tests.places import CONFIGS, ROOT
 
@@ -235,3 +238,33 @@ def test_a_bus_that_cannot_be_opened_can_be_tried_again(tmp_path: Path) -> None:
     for _ in range(2):
         with in_control(config, Output()), pytest.raises(BusError, match="no virtual bus at"):
             CanopenSession().open(config)
+
+
+# --- The loop compiles while the virtual bus starts; it opens the bus when that is there ---
+@pytest.mark.parametrize("stopped", [False, True])
+def test_the_loop_gets_its_own_bus_when_that_is_there_and_a_stop_ends_the_waiting(stopped: bool) -> None:
+    done: list[str] = []
+
+    def leave_if_asked() -> None:
+        if stopped:
+            raise KeyboardInterrupt
+
+    class Own:
+        def until_bus(self, alive: Callable[[], None]) -> None:
+            assert done == []
+            alive()
+            done.append("there")
+
+    session: Any = SimpleNamespace(own=Own(), signals=SimpleNamespace(leave_if_asked=leave_if_asked))
+    loop: Any = SimpleNamespace(bus_is_there=lambda: done.append("opened"))
+    with pytest.raises(KeyboardInterrupt) if stopped else contextlib.nullcontext(), Session._bus_there(session, loop):
+        done.append("run")
+    assert done == ([] if stopped else ["there", "opened", "run"])
+
+
+def test_a_bus_of_others_is_there_from_the_beginning() -> None:
+    done: list[str] = []
+    session: Any = SimpleNamespace(own=None)
+    loop: Any = SimpleNamespace(bus_is_there=lambda: done.append("opened"))
+    with Session._bus_there(session, loop):
+        assert done == ["opened"]
