@@ -21,7 +21,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.recording.run_log import RunLogWriter
-from jointctl.tools.verbs.scope import START_LATE_S
+from jointctl.tools.scoping.feed import LATE_S
 from tests.browser import PROGRAM, Browser, Tab, free_port
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
@@ -534,7 +534,7 @@ def test_a_start_that_was_held_up_is_not_taken(bench: Any, browser: Browser, who
     os.kill(pid, signal.SIGSTOP)
     try:
         tab.click("start")
-        time.sleep(START_LATE_S + 1.0)
+        time.sleep(LATE_S + 1.0)
     finally:
         os.kill(pid, signal.SIGCONT)
     tab.until("document.querySelector('[data-testid=\"late\"]').innerText.includes('press it again')")

@@ -35,6 +35,7 @@ AT_ONCE = 64  # messages of a server that are read in one look: it must not hold
 PIECE = 64  # records a message; less than the buffer of the socket
 COUNT_AGAIN_S = 2.0  # how often the server tells the number of open pages, changed or not
 SILENT_S = 3.0 * COUNT_AGAIN_S  # without that word nobody is there: the server hangs, and STOP with it
+LATE_S = 4.0  # of what makes a joint move; such a word comes once a second, and waits for a second in the page's server
 SERVER_SILENT = (
     f"no word from the scope's server for {SILENT_S:g} s: it counts as no page open; Ctrl-C or `jointctl stop` brakes"
 )
@@ -75,6 +76,15 @@ def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
         raise UsageError(f"--port (={port}) must be in [1..65535]")
     require_free("the scope", host, port, "choose another --port")
     return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)
+
+
+def in_time(request: ViewerRequest) -> bool:
+    """Whether who asks had a word of this program no longer than LATE_S ago: its `told_s`, which comes back with it.
+
+    What was held up on its way, or by a server or a program that stood still, comes when nobody expects it.
+    """
+    told_s = request.values.get("told_s")
+    return isinstance(told_s, float) and 0.0 <= time.monotonic() - told_s <= LATE_S
 
 
 def require_free(what: str, host: str, port: int, hint: str) -> None:

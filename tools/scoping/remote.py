@@ -27,7 +27,7 @@ from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
-from jointctl.tools.scoping.feed import ScopeFeed, require_free, server_process
+from jointctl.tools.scoping.feed import ScopeFeed, in_time, require_free, server_process
 from jointctl.tools.scoping.remote_options import (
     LISTEN_AT,
     ObserveOptions,
@@ -134,6 +134,9 @@ class EnabledFromElsewhere:
         while feed.stop_request() is StopRequest.NONE and time.monotonic() < give_up_s:
             for request in feed.requests():
                 if request.kind == "enable" and request.values.get("number") == number:
+                    if not in_time(request):
+                        self._output.note(f"~/enable of {request.who} came late and was not taken")
+                        continue
                     self._output.note(f"enabled by {request.who}")
                     feed.settings({"stage": "enabled"})
                     return True
@@ -141,7 +144,7 @@ class EnabledFromElsewhere:
                 raise JointctlError("the ROS 2 server has ended: nothing can enable the joint", "what it said is above")
             if time.monotonic() - told_s > TELL_AGAIN_S:
                 told_s = time.monotonic()
-                feed.settings({"stage": "approved", "number": number})
+                feed.settings({"stage": "approved", "number": number, "told_s": told_s})
             time.sleep(POLL_S)
         feed.settings({"stage": "declined"})
         return False

@@ -290,7 +290,7 @@ class Ros2View:
         if self.view.settings.get("stage") != "approved":
             return False, NOT_WAITING
         self.view.settings["stage"] = "enable asked for"  # once
-        taken = self.way.ask("enable", who, {"number": self.view.settings.get("number")})
+        taken = self.way.ask("enable", who, {name: self.view.settings.get(name) for name in ("number", "told_s")})
         return taken, "enabling" if taken else NOT_TAKEN
 
     # --- Publisher ---

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 HOST, PORT = "127.0.0.1", 8642
 POLL_S = 0.05
 TELL_AGAIN_S = 1.0
-START_LATE_S = 4.0  # from the last word that the browser had: two seconds old at most where nothing is held up
 START_LATE = "Start came late and was not taken, nothing moves: press it again"
 PREPARED_S = 300.0  # what was found and shown holds for so long; then the run is to be prepared again
 
@@ -202,6 +200,7 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
     import secrets
 
     from jointctl.firmware_py.states import StopRequest
+    from jointctl.tools.scoping.feed import in_time
 
     number = secrets.randbelow(1 << 48)
     told_s, give_up_s, late = 0.0, time.monotonic() + patience_s, ""
@@ -209,7 +208,7 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
         for request in feed.requests():
             given = request.values.get("number"), request.values.get("clear")
             if request.kind == "start" and given == (number, True):
-                if _age_s(request.values.get("told_s")) <= START_LATE_S:
+                if in_time(request):
                     return True
                 late, told_s = START_LATE, 0.0
         _require_server(feed)
@@ -218,12 +217,6 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
             feed.settings({"stage": "ready", "number": number, "lines": lines, "told_s": told_s, "late": late})
         time.sleep(POLL_S)
     return False
-
-
-def _age_s(told_s: object) -> float:
-    """Of a word that was told then; inf for what was never told."""
-    age_s = time.monotonic() - told_s if isinstance(told_s, float) else math.inf
-    return age_s if age_s >= 0.0 else math.inf
 
 
 def _wait_for_prepare(feed: ScopeFeed, last_end: dict[str, Any]) -> int:

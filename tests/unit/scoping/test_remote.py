@@ -23,7 +23,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.recording.run_log import INFO, WARNING
 from jointctl.tools.scoping import remote
-from jointctl.tools.scoping.feed import ScopeFeed
+from jointctl.tools.scoping.feed import LATE_S, ScopeFeed
 from jointctl.tools.scoping.foxglove_server import set_point_of
 from jointctl.tools.scoping.remote import EnabledFromElsewhere, joint_name
 from jointctl.tools.scoping.remote_options import RemoteOptions, check_remote, foxglove_place, with_values
@@ -130,7 +130,7 @@ def consent_of(ends: Any, answer: Callable[[Any], ViewerRequest | None], monkeyp
 
 
 def enable(told: Any) -> ViewerRequest:
-    return ViewerRequest("enable", "a node", {"number": told.get("number")})
+    return ViewerRequest("enable", "a node", {name: told.get(name) for name in ("number", "told_s")})
 
 
 STOP = ViewerRequest("stop", "a node", {"strength": 1})
@@ -142,6 +142,15 @@ def test_an_enable_after_the_approval_counts_for_this_one(ends: Any, monkeypatch
     first = json.loads(ends[1].recv(4096)[1:])
     assert first["stage"] == "enabled"
     assert consent.agreed([]) is True  # another approval, another number
+
+
+def test_an_enable_that_was_held_up_is_not_taken(ends: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It knows the number, but its server had no word of this program for long when it came."""
+
+    def late(told: Any) -> ViewerRequest:
+        return ViewerRequest("enable", "a node", {**told, "told_s": time.monotonic() - LATE_S - 0.1})
+
+    assert consent_of(ends, late, monkeypatch).agreed([]) is False
 
 
 @pytest.mark.parametrize("values", [{}, {"number": None}, {"number": 1}, {"number": "x"}])

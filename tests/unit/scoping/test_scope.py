@@ -45,7 +45,6 @@ from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.session.session import Session
 from jointctl.tools.verbs import scope as scope_module
-from jointctl.tools.verbs.scope import START_LATE_S
 from tests.sessions import constants_of
 
 
@@ -709,7 +708,9 @@ class Feed:
     def pressed(self) -> None: ...
 
 
-@pytest.mark.parametrize(("late_s", "taken"), [(START_LATE_S - 0.5, True), (START_LATE_S + 0.5, False), (None, False)])
+@pytest.mark.parametrize(
+    ("late_s", "taken"), [(feed_module.LATE_S - 0.5, True), (feed_module.LATE_S + 0.5, False), (None, False)]
+)
 def test_a_start_that_was_held_up_is_not_taken_and_one_after_it_is(
     monkeypatch: pytest.MonkeyPatch, late_s: float | None, taken: bool
 ) -> None:
@@ -731,7 +732,8 @@ def test_a_start_that_was_held_up_is_not_taken_and_one_after_it_is(
                 told_s = clock.now_s - late_s if late_s is not None else None
             return [ViewerRequest("start", "a viewer", {"number": last["number"], "clear": True, "told_s": told_s})]
 
-    monkeypatch.setattr(scope_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=sleep))
+    for module in (scope_module, feed_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=sleep))
     feed: Any = Held()
     assert scope_module.confirmed(feed, ["moves"])
     assert len(pressed) == (1 if taken else 2)
