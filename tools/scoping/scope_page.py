@@ -44,14 +44,18 @@ _PRESSED = """window.jointctlStop = () => {
     .catch(() => tell('NOT_TAKEN', true))
 }"""
 
-# What is pressed while the page is cut off, its library would send later, when no one expects it: it is refused.
+# What is pressed while the page is cut off, its library would send later, when no one expects it: it is refused.  Not
+# while a new page comes up: what is pressed there (Start cannot be) is sent with its first connection.
 # Escape always; space too while the joint is under control, also from a field or a focused button: nothing there needs
 # it then.  A key that is held down is one press.
 _WATCH = """<script>
 PRESSED
 const isSpace = event => event.key === ' ' || event.code === 'Space'
 const byName = name => document.querySelector(`[data-testid="${name}"]`)
+let wasConnected = false
 const refuse = event => {
+  wasConnected ||= Boolean(window.socket?.connected)
+  if (!wasConnected) return
   const beat = byName('beat'), stale = byName('stale'), word = byName('stop-word')
   if (!beat || !stale || !word || beat.textContent.endsWith('OVER')) return
   if (window.socket?.connected && stale.style.display === 'none') return
@@ -84,6 +88,7 @@ document.addEventListener('keyup', event => {
   let seen = '', at = Date.now()
   setInterval(() => {
     const beat = document.querySelector('[data-testid="beat"]'), stale = document.querySelector('[data-testid="stale"]')
+    wasConnected ||= Boolean(window.socket?.connected)
     if (!beat || !stale) return
     if (beat.textContent !== seen) { seen = beat.textContent; at = Date.now() }
     const late = Date.now() - at > STALE_MS && !beat.textContent.endsWith('OVER')
