@@ -545,7 +545,7 @@ def test_a_start_that_was_held_up_is_not_taken(bench: Any, browser: Browser, who
 
 def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(bench: Any, browser: Browser) -> None:
     """The page's library would keep it, and send it when the page has its connection again."""
-    _scope, tab, _url = opened(bench, browser)
+    _scope, tab, url = opened(bench, browser)
     tab.click("clear")
     tab.until("!document.querySelector('[data-testid=\"start\"]').disabled")
     tab.js("void window.socket.disconnect()")
@@ -563,4 +563,5 @@ def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(
     tab.js("void window.socket.disconnect()")
     tab.click("stop")  # a request of its own
     tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP taken')")
+    state_is(browser.open(url), "the run has ended")  # it brakes first
     assert bench.disabled()
