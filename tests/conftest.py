@@ -60,6 +60,11 @@ def pytest_configure() -> None:
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Some tests wait: three at once on two cores."""
+    return 3 * (os.cpu_count() or 1) // 2 or 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Each test gets the marker of its folder, before -m chooses; `slow` tells why.
 
