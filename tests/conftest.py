@@ -62,7 +62,7 @@ def pytest_configure() -> None:
 
 def pytest_xdist_auto_num_workers() -> int:
     """Some tests wait: three at once on two cores."""
-    return 3 * (os.cpu_count() or 1) // 2 or 1
+    return 3 * (os.cpu_count() or 1) // 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

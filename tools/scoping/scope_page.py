@@ -16,7 +16,7 @@ from nicegui.events import GenericEventArguments
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.scoping.chart import Chart
-from jointctl.tools.scoping.feed import OVER, ScopeOrder
+from jointctl.tools.scoping.feed import LATE_S, OVER, ScopeOrder
 from jointctl.tools.scoping.history import History, percentiles_us
 from jointctl.tools.session.display import ViewerRequest, fault_words, phase_name, viewer
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
@@ -71,7 +71,7 @@ const refuse = event => {
 }
 for (const kind of ['click', 'keydown', 'keyup']) document.addEventListener(kind, refuse, true)
 document.addEventListener('keydown', event => {
-  const beat = document.querySelector('[data-testid="beat"]')
+  const beat = byName('beat')
   const moves = beat && beat.textContent.endsWith('MOVES')
   if (event.key !== 'Escape' && !(moves && isSpace(event))) return
   event.preventDefault()
@@ -79,7 +79,7 @@ document.addEventListener('keydown', event => {
   if (!event.repeat) window.jointctlStop()
 }, true)
 document.addEventListener('keyup', event => {
-  const beat = document.querySelector('[data-testid="beat"]')
+  const beat = byName('beat')
   if (!isSpace(event) || !beat || !beat.textContent.endsWith('MOVES')) return
   event.preventDefault()
   event.stopImmediatePropagation()
@@ -87,7 +87,7 @@ document.addEventListener('keyup', event => {
 (() => {
   let seen = '', at = Date.now()
   setInterval(() => {
-    const beat = document.querySelector('[data-testid="beat"]'), stale = document.querySelector('[data-testid="stale"]')
+    const beat = byName('beat'), stale = byName('stale')
     wasConnected ||= Boolean(window.socket?.connected)
     if (!beat || !stale) return
     if (beat.textContent !== seen) { seen = beat.textContent; at = Date.now() }
@@ -405,7 +405,10 @@ IDLE_SHARE = 3.0  # drawing leaves at least so many times its own duration to ev
 SLOW = 5  # every so many refreshes the texts are renewed
 STATISTICS_s = 10.0
 SHOWN_EVENTS = 8
-SILENT_s = {"running": 2.0, "ready": 4.0}  # a run tells something 50 times a second, a question is told once a second
+SILENT_s = {
+    "running": 2.0,  # something is told 50 times a second
+    "ready": LATE_S,  # once a second
+}
 CSS = (
     ".q-field__label{font-size:13px} body{font-size:14px} .nicegui-content{padding:0 14px 10px; gap:8px}"
     " .scope-head{position:sticky; top:0; z-index:10; background:#fff; padding:10px 0 4px}"

@@ -38,8 +38,11 @@ def report(
         if len(log.records) < 2:
             raise DataError(f"{path}: nothing to report, the run has {len(log.records)} records")
     names = of_one_arm(logs)
-    title = f"{paths[0].stem.removesuffix(f'.{file_stems(names[:1])[0]}')}: {', '.join(names)}" if names else ""
-    title, names = title or " and ".join(log_names(paths)), names or log_names(paths)
+    if names:
+        title = f"{paths[0].stem.removesuffix(f'.{file_stems(names[:1])[0]}')}: {', '.join(names)}"
+    else:
+        names = log_names(paths)
+        title = " and ".join(names)
     html = page(title, report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
     write_page(target, html, paths)
     output.result(str(target), {"report": str(target), "logs": [str(path) for path in paths]}, target)
