@@ -321,9 +321,11 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
     for axis in range(len(memory.state)):
         state, sample = memory.state[axis], samples[axis]
         state.slot_ns = slot.deadline_ns
-        # a sample that answers an earlier SYNC belongs to no slot that could be named
-        late_ns = slot.wake_ns - slot.deadline_ns + sample.sync_late_ns
-        state.sample_late_s = late_ns * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
+        asked_ns = slot.wake_ns + int(sample.sync_late_ns)
+        # what came before this SYNC answers the last one: so far from this slot, it would look like a leap
+        of_sync_ns = asked_ns if sample.time_ns > slot.wake_ns else state.asked_ns
+        state.sample_late_s = (of_sync_ns - slot.deadline_ns) * 1e-9 if of_sync_ns > 0 else 0.0
+        state.asked_ns = asked_ns
         if slept_ns > SUSPENDED_MIN_NS:
             check_suspension(state, slept_ns * 1e-9)
         own = is_stopping(state)

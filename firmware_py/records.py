@@ -514,7 +514,8 @@ class AxisState:
     fault_value: f8  # the value that tripped the limit
     trajectory_s: f8
     slot_ns: i8  # the loop's time of this cycle
-    sample_late_s: f8  # from the slot to the request of this cycle's sample; set by a real-time loop, else 0
+    asked_ns: i8  # when the sample of the last cycle was asked for; 0 before the first one
+    sample_late_s: f8  # from the slot to the request that this cycle's sample answers; set by a real-time loop, else 0
     measured_position_rad: f8  # at the slot
     second_position_rad: f8
     measured_torque_Nm: f8

@@ -35,6 +35,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.fault_value = 0.0
     state.cycle = 0
     state.slot_ns = 0
+    state.asked_ns = 0
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0

@@ -184,6 +184,8 @@ def _empty_mailbox(mailbox: FrameQueue, codec: Codec, axis: int, samples: np.nda
 def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
     """SYNC to the drives, their answers into the samples; nothing is waited for."""
     world, codec = link.world, link.codec
+    if len(world.faults) > 0:  # what was late comes before SYNC, as in a real cycle
+        _empty_mailbox(world.fault_memory[0].to_controller, codec, world.faulty, samples, now_ns)
     count = codec.begin(codec.link)
     for axis in range(len(samples)):
         for slot in range(count):

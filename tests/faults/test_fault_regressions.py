@@ -8,10 +8,11 @@ import pytest
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults import FaultKind
+from jointctl.hil.faults import FaultKind, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from tests.made_faults import one_fault
+from tests.made_faults import faults_of, one_fault
 
 AT_s = 2.0  # after the power stage is on: the joint tracks
 HEARTBEAT_s, SAMPLE_AGE_s = 0.2, 0.05
@@ -38,6 +39,18 @@ def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
     longest_s = known_s + IGNORED_MAX_CYCLES * 1e-3 + HEARTBEAT_s + 0.01
     assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= longest_s
     assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize("name", ["virtual", "precise", "realistic"])
+def test_an_answer_that_misses_its_cycle_is_no_leap_of_the_joint(name: str) -> None:
+    """It was taken as of the cycle in which it came: a kick of up to the torque's rate limit at each first late one."""
+    lockstep = LockstepJoint(load_config(shipped_config(name)))
+    late = faults_of(*((FaultKind.TPDO_DELAYED, AT_s + 0.1 * k, 0.004, 0.0004) for k in range(8)))
+    run, plain = (lockstep.run_with_faults(faults, longest_s=4.5) for faults in (late, no_faults()))
+    assert run.fault is Fault.NONE
+    assert int((run.log.sample_age_cycles > 0).sum()) == 8  # each time the first one is missed, the others follow late
+    steps_Nm = [np.abs(np.diff(one.log.command_torque_Nm[one.tracking])).max() for one in (run, plain)]
+    assert steps_Nm[0] < 1.5 * steps_Nm[1]  # 6 to 11 times before
 
 
 @pytest.mark.trips("drive: the loop's RPDOs", "(0.102, True)")
