@@ -1,7 +1,7 @@
 """The C sources for comparison, compiled for this very computer, and the constants as the flat arrays that they take.
 
 Without a compiler the comparisons with C are skipped.  The order of the arrays is that of the structures in
-c/law_tick.h, float64 throughout.
+c/law_tick.h and c/arm_model.h, float64 throughout.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def law_library(folder: Path, options: tuple[str, ...]) -> ctypes.CDLL:
     # linked without -ffast-math: a library that is linked with it makes the whole process flush denormals to zero
     _compile(compiled, target, ("-shared",))
     library = ctypes.CDLL(str(target))
-    for name in ("run_ticks", "run_hidden"):
-        getattr(library, name).argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_long]
+    for name in ("run_ticks", "run_hidden", "arm_torques"):
+        getattr(library, name).argtypes = [ctypes.c_void_p] * (3 if name == "arm_torques" else 4) + [ctypes.c_long]
         getattr(library, name).restype = None
-    for name in ("law_doubles", "state_doubles"):
+    for name in ("law_doubles", "state_doubles", "link_doubles"):
         getattr(library, name).restype = ctypes.c_long
     return library
 
@@ -123,3 +123,13 @@ def setting_doubles(axis: Any, port: Any) -> np.ndarray:
         "control_at", "target_at", "rpdo_length", "position_radpcount", "torque_Nmppermille", "max_permille",
     )  # fmt: skip
     return np.concatenate([[float(port[name]) for name in names], law_doubles(axis)])
+
+
+LINK_FIELDS = (
+    "parent", "kind", "rotation", "offset_m", "mass_kg", "moment_kgm", "inertia_kgm2", "motor_inertia_kgm2",
+)  # fmt: skip
+
+
+def link_doubles(links: Any) -> np.ndarray:
+    """`struct link` of each `ArmLink` record, one after the other."""
+    return np.array([np.concatenate([np.ravel(link[name]) for name in LINK_FIELDS]) for link in links], float)

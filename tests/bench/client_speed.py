@@ -124,7 +124,12 @@ def _stream(joint: jointctl.Joint, seconds: float, rate_Hz: float) -> None:
 
 
 def client_rows(
-    pairs: int, seconds: float, rate_Hz: float, beside: str = SET_POINTS, client_cpu: int | None = None
+    pairs: int,
+    seconds: float,
+    rate_Hz: float,
+    beside: str = SET_POINTS,
+    client_cpu: int | None = None,
+    loop_cpu: int | None = None,
 ) -> list[Row]:
     """A row each for wake-up and work."""
     from jointctl.tools.configuration.load import load_config, shipped_config
@@ -132,7 +137,12 @@ def client_rows(
     config = load_config(shipped_config("virtual"))
     # the program waits for a client that starts
     patient = {"delay_s": STREAM_DELAY_S, "timeout_s": STREAM_TIMEOUT_S, "client_timeout_s": 60.0}
-    config = config.model_copy(update={"stream": config.stream.model_copy(update=patient)})
+    config = config.model_copy(
+        update={
+            "stream": config.stream.model_copy(update=patient),
+            "loop": config.loop.model_copy(update={"cpu": loop_cpu}),
+        }
+    )
     port = free_port()
     at = f"127.0.0.1:{port}"
     costs: list[list[np.ndarray]] = []
@@ -180,10 +190,11 @@ def main(
     rate: Annotated[float, typer.Option(help="set-points a second", min=1.0)] = 500.0,
     beside: Annotated[str, typer.Option("--with", help=f"{SET_POINTS}, {FOXGLOVE} or {ROS2}")] = SET_POINTS,
     client_cpu: Annotated[int | None, typer.Option(help="the only processor of the client", min=0)] = None,
+    loop_cpu: Annotated[int | None, typer.Option(help="loop.cpu; the server keeps off it", min=0)] = None,
     json: bool = False,
 ) -> None:
     """Measure and print."""
-    rows = client_rows(pairs, seconds, rate, beside, client_cpu)
+    rows = client_rows(pairs, seconds, rate, beside, client_cpu, loop_cpu)
     Output(json=json).result(outcome_table(rows), outcome_data(rows, conditions()))
 
 

@@ -3,7 +3,7 @@
 Ours, C and cyclictest all keep to the last core, and the load to the first: left to the system, the load shares the
 core of one measured loop and not that of the next.  Our loop and the one in C run as a process of their own with the
 same priority and locked memory, on a bus that both find commissioned by the same driver; the load begins after that.
-The C loop has no phases, no limits of motion, no supervision and no model of an arm: it is what the exchange costs.
+The C loop has no phases, no limits of motion and no supervision: it is what exchange, laws and the arm's model cost.
 The Python loops run in this process, as they would in a user's script, with the drive disabled and zero torque.
 FOR THE VIRTUAL JOINT ONLY.
 """
@@ -45,7 +45,7 @@ from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.arms import long_arm
-from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
+from tests.bench.c_programs import NoCompilerError, exchange_program, link_doubles, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, measured, separate_virtual_joint, skipped
 from tests.configurations import changed
 
@@ -147,7 +147,7 @@ def times_from_ns(rows: np.ndarray) -> LoopTimes:
 
 # --- compiled loops ---
 
-SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
+SETTLE_S = 0.5  # left out at the beginning: the C loop enables the drives in it
 POLL_S = 0.02
 END_S = 3.0
 PATIENCE_S = 0.25  # so long a computer may stand still without ending the run
@@ -193,11 +193,13 @@ def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopT
         drive.start_cyclic()
         loop.go(constants, drive.port())
         chunks = []
-        end_s = time.monotonic() + SETTLE_S + seconds
+        end_s = math.inf
         with load(load_name):
             while time.monotonic() < end_s and loop.running():
                 loop.beat()
                 chunks.append(loop.new_records())
+                if end_s == math.inf and (chunks[-1]["drive_state"] == DriveState.ENABLED).any():
+                    end_s = time.monotonic() + SETTLE_S + seconds
                 time.sleep(POLL_S)
         ended_early, verdicts = not loop.running(), [loop.of_axis(axis).verdict() for axis in range(loop.block.axes)]
         loop.request_stop(StopRequest.OFF)
@@ -208,7 +210,9 @@ def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopT
     if ended_early:
         faults = ", ".join(f"{fault.name} ({value:g})" for fault, value in verdicts)
         raise JointctlError(f"the control loop stopped by itself while it was measured: {faults}")
-    records = np.concatenate(chunks)[round(SETTLE_S * config.loop.rate_Hz) :]
+    records = np.concatenate(chunks)
+    enabled = int(np.argmax(records["drive_state"] == DriveState.ENABLED))
+    records = records[enabled + round(SETTLE_S * config.loop.rate_Hz) :]
     _require_enabled("our", records["drive_state"] == DriveState.ENABLED)
     rows = np.column_stack([records["wake_late_ns"], records["round_trip_ns"], records["work_ns"]])
     return replace(times_from_ns(rows.astype(np.int64)), skipped=int(records["skipped"].sum()))
@@ -232,10 +236,12 @@ def run_c(program: Path, given: Config | ArmConfig, seconds: float, load_name: s
         commissioned(given) as (drive, constants),
     ):
         settings = [setting_doubles(*one) for one in zip(constants, drive.port(), strict=True)]
+        if not isinstance(given, Config):
+            settings += [given.model.constants[0].gravity_mps2, link_doubles(given.model.links).ravel()]
         drive.start_cyclic()
         fd = end.fileno()
         receive_ns = int(RECEIVE_SHARE * period_ns)
-        numbers = (fd, config.loop.priority or 0, period_ns, receive_ns, cycles, len(settings))
+        numbers = (fd, config.loop.priority or 0, period_ns, receive_ns, cycles, len(joints_of(given)))
         with load(load_name), cores_awake(), on_core(config.loop.cpu):  # as ours, and awake as cyclictest as well
             result = subprocess.run(
                 [str(program), *map(str, numbers)],
@@ -442,7 +448,7 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
 
 
 def arm_for_comparison(path: Path, channel: str) -> ArmConfig:
-    """An arm with the law that the C source knows; ours has the arm's model besides."""
+    """An arm with the law that the C source knows."""
     arm = arm_on_bus(load_arm(path), GivenPlace("jointctl", channel))
     joints = tuple(
         changed(

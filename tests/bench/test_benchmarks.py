@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
+from tests.arms import arm_of, random_links, set_motion
 from tests.bench import c_programs, speed
 from tests.bench.c_programs import (
     FAST_MATH,
@@ -27,6 +29,7 @@ from tests.bench.c_programs import (
     NoCompilerError,
     law_doubles,
     law_library,
+    link_doubles,
     state_doubles,
 )
 from tests.bench.exchange_speed import (
@@ -118,6 +121,24 @@ def test_every_law_gives_the_numbers_of_the_kernel_and_with_another_gain_others(
         pytest.skip(error.message)
     assert difference(kernel_ticks(constants), same, inputs) <= SAME_NUMBERS
     assert difference(kernel_ticks(constants), different, inputs) > SAME_NUMBERS
+
+
+@pytest.mark.parametrize("joints", [1, 3, 7])
+def test_the_arm_in_c_gives_the_torques_of_the_model(tmp_path, joints):
+    random = np.random.default_rng(joints)
+    arm = arm_of(random_links(random, joints))
+    motions = np.zeros((joints, 4))
+    motions[:, :3] = random.normal(size=(joints, 3))
+    set_motion(arm, *motions[:, :3].T)
+    newton_euler(arm)
+    try:
+        library = law_library(tmp_path, OPTIMISED)
+    except NoCompilerError as error:
+        pytest.skip(error.message)
+    links = link_doubles(arm.links)
+    assert library.link_doubles() == links.shape[1]
+    library.arm_torques(links.ctypes.data, arm.constants[0].gravity_mps2.ctypes.data, motions.ctypes.data, joints)
+    assert motions[:, 3] == pytest.approx(arm.motion.torque_Nm[:joints], rel=1e-9, abs=1e-9)
 
 
 def test_nothing_is_allocated_per_tick(constants):

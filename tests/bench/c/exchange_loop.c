@@ -1,12 +1,12 @@
-/* The exchange of the control loop in plain C, for comparison: same deadlines, same frames, same waits, same law.
+/* The exchange of the control loop in plain C, for comparison: same deadlines, frames, waits, law and model of the arm.
  *
- *     sleep until the absolute deadline -> SYNC -> wait for each TPDO -> laws -> RPDOs -> a log record of each drive
+ *     sleep until the absolute deadline -> SYNC -> wait for each TPDO -> arm's model, laws -> RPDOs -> log records
  *
  * FOR THE VIRTUAL JOINT AND ARM ONLY: it has no phases, no limits of motion, no faults and no supervisor.  It enables
- * the drives and holds the positions that it finds, then switches the drives off.
+ * the drives and swings about the positions that it finds, then switches the drives off.
  *
  * exchange_loop FD PRIORITY PERIOD_ns RECEIVE_ns CYCLES DRIVES; on stdin a struct setting of each drive, all on one
- * bus; on stdout CYCLES rows of int64 [wake-up after the deadline, wait for the samples, work, all enabled, slots
+ * bus, then, of an arm, its gravity[3] and a struct link of each; on stdout CYCLES rows of int64 [wake-up after the deadline, wait for the samples, work, all enabled, slots
  * skipped], times in ns, -1 for a wait in which one did not come.
  */
 #define _GNU_SOURCE
@@ -22,6 +22,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "arm_model.h"
 #include "law_tick.h"
 
 struct frame {
@@ -38,7 +39,9 @@ struct setting { /* doubles for the same reason as struct law */
 
 #define LOG_BYTES 408 /* about what the control loop records each cycle */
 #define LOG_RECORDS 16384
-#define MOST_DRIVES 16
+#define MOST_DRIVES MOST_LINKS
+#define SWING_rad 0.1
+#define SWING_radps 1.5 /* of the first drive; each of the others half a radian a second quicker */
 
 static char log_ring[LOG_RECORDS][LOG_BYTES];
 
@@ -73,6 +76,23 @@ struct drive {
 };
 
 static struct drive drives[MOST_DRIVES];
+static struct link links[MOST_LINKS];
+static struct motion motion[MOST_LINKS + 1];
+
+/* The desired motion, from rest, and what the arm asks for beyond each joint's own inertia. */
+static void plan(int count, int arm, double moving_s)
+{
+    for (int i = 0; i < count; i++) {
+        double w = SWING_radps + 0.5 * i, phase = w * moving_s, step = moving_s > 0.0 ? SWING_rad * w : 0.0;
+        motion[i].position = drives[i].start + SWING_rad * (1.0 - cos(phase));
+        motion[i].velocity = step * sin(phase);
+        motion[i].acceleration = step * w * cos(phase);
+    }
+    if (arm)
+        newton_euler(links, motion, count);
+    for (int i = 0; i < count; i++)
+        motion[i].torque -= arm ? drives[i].k.law.inertia_kgm2 * motion[i].acceleration : 0.0;
+}
 
 /* Takes everything that waits. */
 static void drain(int fd, int count)
@@ -130,6 +150,12 @@ int main(int argc, char **argv)
         drive->rpdo.length = (uint8_t)drive->k.rpdo_length;
         drive->start = NAN;
     }
+    double gravity[3];
+    int arm = fread(gravity, sizeof gravity, 1, stdin) == 1;
+    if (arm && fread(links, sizeof links[0], count, stdin) != (size_t)count)
+        return 2;
+    for (int k = 0; k < 3; k++)
+        motion[count].pull[k] = arm ? -gravity[k] : 0.0;
     int64_t(*times)[5] = calloc(cycles, sizeof *times);
     if (times == NULL)
         return 3;
@@ -147,6 +173,7 @@ int main(int argc, char **argv)
     heartbeat.payload[0] = 5;
     int heartbeat_cycles = (int)first->heartbeat_cycles;
     int64_t deadline_ns = now_ns() + period_ns;
+    double moving_s = 0.0;
     for (int64_t cycle = 0; cycle < cycles; cycle++) {
         struct timespec until = {deadline_ns / 1000000000LL, deadline_ns % 1000000000LL};
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR)
@@ -169,12 +196,15 @@ int main(int argc, char **argv)
         }
         int64_t waited_ns = now_ns() - started_ns;
         int enabled = 1;
+        plan(count, arm, moving_s);
         for (int i = 0; i < count; i++) {
             struct drive *drive = &drives[i];
             const struct setting *k = &drive->k;
             int own = (drive->status & 0x6F) == 0x27;
-            double torque =
-                isnan(drive->start) ? 0.0 : law_tick(&k->law, &drive->law, drive->position, drive->start, 0.0, 0.0);
+            const struct motion *to = &motion[i];
+            double torque = isnan(drive->start) ? 0.0
+                                                : law_tick(&k->law, &drive->law, drive->position, to->position,
+                                                           to->velocity, to->acceleration, to->torque);
             double permille = fmin(fmax(torque / k->torque_Nmppermille, -k->max_permille), k->max_permille);
             int16_t target = own ? (int16_t)lround(permille) : 0;
             uint16_t command = cycle + 50 < cycles ? (uint16_t)control_word(drive->status) : 0;
@@ -182,6 +212,7 @@ int main(int argc, char **argv)
             memcpy(drive->rpdo.payload + (int)k->target_at, &target, 2);
             enabled &= own;
         }
+        moving_s += enabled ? 1e-9 * period_ns : 0.0;
         for (int i = 0; i < count; i++)
             send_frame(fd, &drives[i].rpdo);
         int64_t end_ns = now_ns();

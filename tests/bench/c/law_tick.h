@@ -87,9 +87,10 @@ static inline void adapt_network(const struct law *k, struct law_state *s, doubl
             s->weights[i] = fmin(fmax(s->weights[i], -limit), limit);
 }
 
-/* Measured position and desired motion to the limited torque [Nm]. */
+/* Measured position and desired motion to the limited torque [Nm]; arm_torque: what an arm asks for beyond the joint's
+ * own inertia. */
 static inline double law_tick(const struct law *k, struct law_state *s, double position, double desired_position,
-                              double desired_velocity, double desired_acceleration)
+                              double desired_velocity, double desired_acceleration, double arm_torque)
 {
     double error = position - desired_position;
     if (s->primed == 0.0) {
@@ -102,7 +103,7 @@ static inline double law_tick(const struct law *k, struct law_state *s, double p
     }
     s->last_position_rad = position;
     s->last_error_rad = error;
-    s->inertia_torque_Nm = k->inertia_kgm2 * desired_acceleration;
+    s->inertia_torque_Nm = k->inertia_kgm2 * desired_acceleration + arm_torque;
     s->feedback_torque_Nm = -k->inertia_kgm2 * (k->kv * s->error_rate_radps + k->kp * error);
     s->gravity_torque_Nm = k->coriolis_Nmspr * s->velocity_radps + k->gravity_Nm * sin(position - k->gravity_zero_rad);
     s->friction_torque_Nm = lugre_torque_Nm(k, s, desired_velocity);
