@@ -10,7 +10,8 @@ The error is that after a step of friction, |G S / w| over all frequencies, and 
 the speed changes: |G S / RIPPLE_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
 filter, then Nelder and Mead from its best points; kp follows from kv.  A joint that is late beside its resonance bears
 two to seven times the kv behind a filter far below that.  By this error a quick observer and a stiff loop
-look alike; on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit.  A
+look alike; on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit, and
+one far from the usual bandwidth costs a little: the error is flat there, and its least a matter of chance.  A
 goal that is missed costs in proportion, so that the result of a joint that does not allow all of them is the nearest
 one, and says so.
 """
@@ -63,6 +64,8 @@ TWO_ENCODERS = "[joint_encoder] beside an encoder on the motor"
 SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
+USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for another
+UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 LEARNING_FACTOR = 0.9  # of a repetition, at most
 _LOWEST_Hz, _POINTS = 0.3, 240
@@ -81,10 +84,17 @@ class Law:
     kp_of_kv: float
 
     most_observer_radps: float = math.inf
+    usual_observer_radps: float | None = None
 
     def beyond(self, settings: LoopSettings) -> float:
         """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
         return max(settings.observer_radps / self.most_observer_radps - 1.0, 0.0)
+
+    def unusual(self, settings: LoopSettings) -> float:
+        """What an observer far from the usual one costs, in the logarithm of the error."""
+        if self.usual_observer_radps is None:
+            return 0.0
+        return UNUSUAL * math.log(settings.observer_radps / self.usual_observer_radps) ** 2
 
     def settings(self, settings: LoopSettings, logarithms: Array) -> LoopSettings:
         """With these values, to three digits."""
@@ -106,7 +116,7 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
     ),
     "paper": Law(
         "paper", paper_control, ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
@@ -196,7 +206,7 @@ class ChosenGains:
     def with_gains(self, one: Judged) -> Control:
         """[control] with the gains of another choice."""
         update = _changes(one.settings, LAWS[self.law])
-        learning = _converging(one.settings, self.control.learning)
+        learning = converging(one.settings, self.control.learning)
         return self.control.model_copy(update={**update, "learning": learning})
 
 
@@ -330,7 +340,7 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     def cost(one: Judged, least_error: float | None) -> float:
         if not one.stable:
             return 100.0 + math.log(one.error)
-        missed = PENALTY * (sum(goals.missed(one).values()) + law.beyond(one.settings))
+        missed = PENALTY * (sum(goals.missed(one).values()) + law.beyond(one.settings)) + law.unusual(one.settings)
         if objective == "settling":
             return math.log(one.settling_s) + 0.2 * math.log(one.error) + missed
         if least_error is not None:
@@ -360,7 +370,7 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     chosen = control.model_copy(update=_changes(best.settings, law))
     return ChosenGains(
         law.name, objective, best, goals.missed(best), tuple(search.tried), goals,
-        chosen.model_copy(update={"learning": _converging(best.settings, chosen.learning)}),
+        chosen.model_copy(update={"learning": converging(best.settings, chosen.learning)}),
     )  # fmt: skip
 
 
@@ -394,7 +404,7 @@ def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
     return named
 
 
-def _converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
+def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
     """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain."""
     if learning is None or settings.kind not in OBSERVING:
         return None
