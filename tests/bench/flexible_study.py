@@ -3,7 +3,8 @@
     python tests/bench/flexible_study.py [--seed 52078] [--plants 40] [--csv FILE]
 
 Joints and motions are those of `jointctl study --plants realistic` (`tools/experiments/controller_study.py`), the gains
-chosen for what is believed of each; simulated time, errors of the link itself after 75 s.  |S| and stability are those
+chosen for what is believed of each, learning slowed down until it converges; simulated time, errors of the link itself
+after 75 s.  |S| and stability are those
 of the margin gate: the joint that is believed, stiffness +- `margin.stiffness_error`, link inertia over
 `margin.payload_range`, free and held by friction; and, by itself, with half of the link's inertia.
 """
@@ -15,6 +16,7 @@ import csv
 import math
 import os
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import largest_sensitivity, learning_convergence  # noqa: E402
+from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import law_resolution_rad  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, quantile, random_plant  # noqa: E402
@@ -39,12 +42,14 @@ from jointctl.tools.experiments.controllers import (  # noqa: E402
 )
 from jointctl.tools.experiments.scenarios import (  # noqa: E402
     RANDOM_MOTIONS,
+    ErrorFigures,
     Scenario,
     error_figures,
     random_motion,
     run_scenario,
 )
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
+from jointctl.tools.tuning.gains import converging  # noqa: E402
 
 AFTER_s = 75.0
 LEARNING = {"gain": 0.6, "error_gain_ps2": 300.0, "lead_cycles": 10, "half_width_cycles": 10}
@@ -86,40 +91,50 @@ def _half_link(settings: LoopSettings) -> LoopSettings:
     return replace(settings, joints=(replace(free[0], link_kgm2=link_kgm2, stiffness_Nmprad=stiffness_Nmprad),))
 
 
+def runs_of(
+    config: Config, chosen: Controller, seed: int, index: int
+) -> Iterator[tuple[str, Scenario, ErrorFigures, float]]:
+    """(law, motion, errors after 75 s, worst factor of one repetition of learning or nan) of one joint, each law."""
+    joint = LockstepJoint(config)
+    settings = loop_settings(controller_config(config, chosen))[0]
+    for name, changes in LAWS.items():
+        control, convergence = changed(chosen.control, changes, name), math.nan
+        if control.learning is not None:
+            control = control.model_copy(update={"learning": converging(settings, control.learning)})
+        if control.learning is not None:
+            convergence = learning_convergence(settings, control.learning).worst_factor
+        constants = controller_constants(
+            config, Controller(name, control, chosen.friction), joint.report.start_position_rad
+        )
+        for scenario in MOTIONS[name]:
+            motion = None
+            if scenario in RANDOM_MOTIONS:
+                motion = random_motion(scenario, seed, index, config.trajectory.duration_s)
+            run = run_scenario(joint, constants, scenario, motion=motion)
+            yield name, scenario, error_figures(run, AFTER_s, motion, law_resolution_rad(config)), convergence
+
+
 def rows_of(seed: int, index: int) -> list[Row]:
     """All runs of one joint."""
     base = load_config(shipped_config("realistic"))
     config = random_plant(base, EnsembleSettings(flexible=True), seed, index)
     assert config.virtual is not None
-    joint, found = LockstepJoint(config), []
     control = changed(base.control, {"feed_forward_lead_s": "auto"}, "realistic")
     chosen = with_chosen_gains(config, Controller("both encoders", control, base.friction))
     settings = loop_settings(controller_config(config, chosen))[0]
     largest_s, half_link_s = largest_sensitivity(settings)[0], largest_sensitivity(_half_link(settings))[0]
-    for name, changes in LAWS.items():
-        law = Controller(name, changed(chosen.control, changes, name), base.friction)
-        constants = controller_constants(config, law, joint.report.start_position_rad)
-        convergence = math.nan
-        if law.control.learning is not None:
-            convergence = learning_convergence(settings, law.control.learning).worst_factor
-        for scenario in MOTIONS[name]:
-            motion = None
-            if scenario in RANDOM_MOTIONS:
-                motion = random_motion(scenario, seed, index, base.trajectory.duration_s)
-            run = run_scenario(joint, constants, scenario, motion=motion)
-            figures = error_figures(run, AFTER_s, motion, law_resolution_rad(config))
-            found.append(
-                Row(index, config.virtual.friction_kind, name, scenario, figures.fault, figures.true_rmse_mrad,
-                    figures.true_peak_mrad, figures.chatter_Nm, largest_s, convergence, half_link_s)
-            )  # fmt: skip
-    return found
+    return [
+        Row(index, config.virtual.friction_kind, name, scenario, figures.fault, figures.true_rmse_mrad,
+            figures.true_peak_mrad, figures.chatter_Nm, largest_s, convergence, half_link_s)
+        for name, scenario, figures, convergence in runs_of(config, chosen, seed, index)
+    ]  # fmt: skip
 
 
 def _text(values: list[float]) -> str:
     return f"{quantile(np.array(values), 0.5):.3f} / {max(values):.3f}" if values else "-"
 
 
-def report(rows: list[Row]) -> None:
+def table(rows: list[Row]) -> None:
     """The table of docs/law.md."""
     print(
         "| law, motion | RMSE, LuGre | stick-slip | peak | chatter [Nm a cycle] | faults |\n|---|---|---|---|---|---|"
@@ -133,6 +148,11 @@ def report(rows: list[Row]) -> None:
             cells = [_text(values) for values in (lugre, sticks, peaks, chatter)]
             faults = sum(1 for row in own if row.fault)
             print("|", " | ".join([f"{name}, {motion}", *cells, str(faults)]), "|")
+
+
+def report(rows: list[Row]) -> None:
+    """The table, and what the loops are like."""
+    table(rows)
     first = {row.plant: row for row in rows}.values()
     print(f"\n{len(first)} joints, {sum(1 for row in first if row.friction == 'stick_slip')} with stick-slip")
     print("largest |S|:", _text([row.largest_s for row in first]))

@@ -1,12 +1,13 @@
 """`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
 
     python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft] [--workers 2] [--csv FILE]
-                                       [--cluster tls://HOST:8786]
+                                       [--motions] [--cluster tls://HOST:8786]
 
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
 reducer and two encoders) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no
 reducer, and the delay of the shipped configuration.  Simulated time.  The same law is chosen a second time from the
-true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s.
+true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s.  `--motions`: what
+was tuned also makes the runs of `flexible_study.py`, with learning and with adaptation, motions that never repeat.
 
 Hysteresis leaves a reducer no single stiffness.  The one that is compared is local, at the excitation's amplitude and
 at the resonance: the multisine under the weak law twists the two true masses, the twist goes through the bristle of the
@@ -44,6 +45,7 @@ from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.configuration.sections import Friction  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
+from jointctl.tools.experiments.controllers import Controller  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
@@ -55,6 +57,7 @@ from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit  # noqa: E402
 from jointctl.tools.tuning.tune_options import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
+from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
 
 RUN_s, FROM_s = 40.0, 20.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
@@ -190,9 +193,9 @@ def rmse_mrad(config: Config) -> float:
     return math.nan if run.fault else 1e3 * float(np.sqrt(np.mean(run.true_error_rad[rows] ** 2)))
 
 
-def tuned(task: tuple[int, int, bool]) -> dict[str, Any]:
+def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     """One joint; with `failed` where it was not tuned."""
-    seed, index, soft = task
+    seed, index, soft, motions = task
     base = load_config(shipped_config("realistic" if soft else "precise"))
     plant = random_plant(base, EnsembleSettings(flexible=soft), seed, index)
     assert plant.virtual is not None
@@ -238,6 +241,14 @@ def tuned(task: tuple[int, int, bool]) -> dict[str, Any]:
     known = known.model_copy(update={"friction": friction})
     best = choose_gains(known, truth, row["law"])
     row["rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
+    if motions:
+        control = job.config.control.model_copy(update={"learning": None})
+        chosen = Controller("tuned", control, job.config.friction)
+        row["motions"] = [
+            Row(index, virtual.friction_kind, name, scenario, figures.fault, figures.true_rmse_mrad,
+                figures.true_peak_mrad, figures.chatter_Nm, math.nan, convergence, math.nan)
+            for name, scenario, figures, convergence in runs_of(job.config, chosen, seed, index)
+        ]  # fmt: skip
     return row
 
 
@@ -253,16 +264,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=90701)
     parser.add_argument("--plants", type=int, default=40)
     parser.add_argument("--soft", action="store_true")
+    parser.add_argument("--motions", action="store_true")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler: docs/cluster.md")
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
-    tasks = [(given.seed, index, given.soft) for index in range(given.plants)]
+    tasks = [(given.seed, index, given.soft, given.motions) for index in range(given.plants)]
     rows: list[dict[str, Any]] = []
     for row in Workers(given.workers, given.cluster).results(tuned, tasks):
         rows.append(row)
         print(row, flush=True)
     rows.sort(key=lambda row: int(row["plant"]))
+    moved = [one for row in rows for one in row.pop("motions", ())]
     good = [row for row in rows if "failed" not in row]
     for row in good:
         row["ratio"] = row["rmse_mrad"] / row["rmse_true_mrad"]
@@ -282,6 +295,8 @@ def main() -> None:
         some = [row for row in good if name in row]
         if some:
             print(f"  interval of {name} holds: {sum(abs(row[name]) <= row[f'{name}_half'] for row in some)}")
+    if moved:
+        table(moved)
 
 
 if __name__ == "__main__":
