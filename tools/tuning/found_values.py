@@ -149,20 +149,25 @@ def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]])
     Sections that are not there are added at the end.  Comments stay, but those of an earlier tune.
     """
     document, newline = document_of(text, MARK)
+    inserted = set()  # headings
     for one in values:
         table: Any = document
         for name in one.section:
             if name not in table:
                 table[name] = tomlkit.table()
+                inserted.add(".".join(one.section))
             table = table[name]
         if one.value is None:
             table.pop(one.key, None)
         elif not (one.key in table and table[one.key] == one.value):
             table[one.key] = list(one.value) if isinstance(one.value, tuple) else one.value
-    lines: list[str] = []
+    lines, section = [""], ""
     for line in tomlkit.dumps(document).splitlines(keepends=True):
         lines.append(line if line.endswith("\n") else line + newline)
         heading = line.split("#")[0].strip()
         if heading.startswith("[") and heading.endswith("]"):
-            lines += [MARK + source + newline for source in sources.get(heading[1:-1].strip(), ())]
+            if section in inserted and lines[-2].strip():
+                lines.insert(-1, newline)
+            section = heading[1:-1].strip()
+            lines += [MARK + source + newline for source in sources.get(section, ())]
     return "".join(lines)

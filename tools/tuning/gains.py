@@ -42,7 +42,7 @@ from jointctl.tools.analysis.linear_loop import (
     two_masses,
 )
 from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
-from jointctl.tools.configuration.config import Config, Control, Learning
+from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.experiments.controllers import from_file, paper_control
@@ -67,7 +67,8 @@ QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for another
 UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
-LEARNING_FACTOR = 0.9  # of a repetition, at most
+LEARNING_FACTOR = 0.9  # of a repetition, wanted
+SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 2, 90
@@ -382,9 +383,12 @@ def _control(config: Config, control: Control) -> Control:
         feed_forward = "none"
     elif config.friction.lugre is None and feed_forward == "lugre_desired":
         feed_forward = "desired"
+    adaptation = None
+    if control.kind == "flexible_joint" and feed_forward == "lugre_desired":
+        adaptation = config.control.adaptation or Adaptation()
     update: dict[str, Any] = {
         "feed_forward": feed_forward, "feed_forward_lead_s": 0.0 if feed_forward == "none" else round(late_s, 6),
-        "adaptation": None,
+        "adaptation": adaptation,
     }  # fmt: skip
     if control.kind in ("computed_torque_observer", "flexible_joint"):
         update["observer_delay_cycles"] = min(max(round(late_s * config.loop.rate_Hz), 1), 15)
@@ -405,16 +409,23 @@ def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
 
 
 def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
-    """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain."""
+    """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain.
+
+    Where that brings none to `LEARNING_FACTOR`, the quickest gains that converge at all; None where none do.
+    """
     if learning is None or settings.kind not in OBSERVING:
         return None
+    slow = None
     for _ in range(8):
-        if learning_convergence(settings, learning).worst_factor <= LEARNING_FACTOR:
+        factor = learning_convergence(settings, learning).worst_factor
+        if factor <= LEARNING_FACTOR:
             return learning
+        if slow is None and factor <= SLOWEST_LEARNING_FACTOR:
+            slow = learning
         learning = learning.model_copy(
             update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
         )
-    return None
+    return slow
 
 
 # --- the picture ---

@@ -512,8 +512,12 @@ class Tune:
                 values.append(Found(("control",), "learning", None, "none: it would not converge, or the law has none"))
             for key, value in (after["learning"] or {}).items():
                 values.append(Found(("control", "learning"), key, value, ""))
-        if before["adaptation"] is not None and after["adaptation"] is None:
-            values.append(Found(("control",), "adaptation", None, "none"))
+        if before["adaptation"] != after["adaptation"]:
+            if after["adaptation"] is None:
+                values.append(Found(("control",), "adaptation", None, "none"))
+            for key, value in (after["adaptation"] or {}).items():
+                source = f"{value}, of friction that adapts to the joint, with the law {gains['law']}"
+                values.append(Found(("control", "adaptation"), key, value, source if key == "reach" else ""))
         friction = self.state["friction"]
         for key, value in friction["section"].items():
             if isinstance(value, dict):

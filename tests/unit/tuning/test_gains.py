@@ -11,9 +11,9 @@ import tomlkit
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.tuning.found_values import MARK, Found, values_of_fit, with_tuned, with_values
-from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains, steady_joints
+from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains, converging, steady_joints
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
@@ -70,6 +70,21 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     judged = margins(loop_settings(changed(config, control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert found.best.settings.observer_radps < 120.0
+    assert found.control.adaptation is not None
+
+
+@pytest.mark.parametrize(("joint", "kept"), [((2.1, 2.2e-3, 1.7, 2.6e4), True), ((2.0, 2.0e-3, 1.7, 5.0e4), False)])
+def test_learning_that_is_slow_at_one_frequency_is_kept_and_none_that_stands_still(
+    joint: tuple[float, float, float, float], kept: bool
+) -> None:
+    """A factor of 0.9 was asked for, which no gains reach there: five of six soft joints did not learn at all."""
+    fit = fit_of(*joint)
+    settings = choose_gains(known(shipped("realistic"), fit), fit).best.settings
+    learning = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
+    found = converging(settings, learning)
+    assert (found is not None) == kept
+    if found is not None:
+        assert 0.9 < learning_convergence(settings, found).worst_factor < 0.99
 
 
 def test_a_joint_that_is_late_beside_its_resonance_gets_a_low_filter_and_passes_the_gate() -> None:
@@ -138,3 +153,10 @@ def test_the_file_keeps_its_comments_and_a_second_tune_replaces_the_first() -> N
     assert "[joint]  # the joint" in text
     assert text.count(MARK) == 2
     assert "2.0 +-" not in text
+
+
+def test_a_section_that_is_put_between_others_stands_apart() -> None:
+    text = with_tuned(
+        "[control]\nkp = 3.0\n\n[log]\nkeep = 2\n", [Found(("control", "adaptation"), "reach", 0.3, "")], {}
+    )
+    assert text == "[control]\nkp = 3.0\n\n[control.adaptation]\nreach = 0.3\n\n[log]\nkeep = 2\n"
