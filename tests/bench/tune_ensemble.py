@@ -242,7 +242,7 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     best = choose_gains(known, truth, row["law"])
     row["rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
     if motions:
-        control = job.config.control.model_copy(update={"learning": None})
+        control = job.config.control.model_copy(update={"learning": None, "adaptation": None})
         chosen = Controller("tuned", control, job.config.friction)
         row["motions"] = [
             Row(index, virtual.friction_kind, name, scenario, figures.fault, figures.true_rmse_mrad,
