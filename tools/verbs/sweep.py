@@ -320,7 +320,7 @@ def sweep(
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
     with contextlib.ExitStack() as stack:
-        command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output)))
+        command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output, motion="sweep")))
         if not options.lockstep:
             command.control = stack.enter_context(in_control(command.config, output))
         try:
