@@ -249,6 +249,7 @@ def test_a_sweep_shows_its_states_and_stops(bench: Any) -> None:
     ended = sweep.finished(60.0)
     assert ended.code == 130, ended.err
     assert "stopped by Foxglove's STOP" in ended.err
+    assert ("data.csv" in ended.out) is (bench.folder / "data.csv").exists()
     assert bench.disabled()
 
 
