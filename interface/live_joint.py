@@ -132,7 +132,9 @@ class LiveMotor:
 
                 load_torques(self.axes.arm)
             output = Output(quiet=True)
-            others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
+            others = self._stack.enter_context(
+                remote(self._options, self._source.config, output, owner=WHO, motion="program")
+            )
             self._stack.enter_context(self._bus)
             asked(self._asked_ns)
             control = self._control = self._bus.enter_context(

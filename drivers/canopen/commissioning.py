@@ -306,8 +306,9 @@ def set_torque_slope(objects: ObjectAccess, torque_per_permille_Nm: float, torqu
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """Scaling from the rated values, then the drive's own torque limit 6072 from the joint's."""
-    rated_mNm = objects.read_if_present(0x6076, what="motor rated torque") or 0
-    rated_mA = objects.read_if_present(0x6075, what="motor rated current") or 0
+    torque_mNm = objects.read_if_present(0x6076, what="motor rated torque")
+    current_mA = objects.read_if_present(0x6075, what="motor rated current")
+    rated_mNm, rated_mA = torque_mNm or 0, current_mA or 0
     tolerance = settings.rated_tolerance
     findings.remarks += [
         *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
@@ -315,8 +316,10 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     ]
     scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
     if scale <= 0.0:
-        index = "6076" if settings.torque_reference == "rated_torque" else "6075"
-        raise DeviceError(f"node {settings.node}: object {index} is 0, so 6071 has no scale (drive.torque_reference)")
+        of_torque = settings.torque_reference == "rated_torque"
+        index, found = ("6076", torque_mNm) if of_torque else ("6075", current_mA)
+        why = f"it has no object {index}" if found is None else f"object {index} is 0"
+        raise DeviceError(f"node {settings.node}: {why}, so 6071 has no scale (drive.torque_reference)")
     findings.torque_per_permille_Nm = scale
     permille = settings.max_torque_permille
     if permille is None:

@@ -53,6 +53,8 @@ def test_foxglove_has_all_joints_takes_vectors_and_stops_all(arm: ArmBench) -> N
     run.saw("  tracking")
     with FoxgloveClient(port) as client:
         client.subscribe("/joint_states", "/joint/elbow")
+        client.set_parameter("control.kp", 1.0)  # an arm has none that a viewer may change
+        client.until(lambda: any("does not support parameters" in text for text in client.statuses))
         client.advertise("/arm/command")
         client.publish({"position_rad": [START_rad, 5.0, START_rad]})
         client.until(lambda: any("elbow: position_rad (=5) must be in [" in text for text in client.statuses))

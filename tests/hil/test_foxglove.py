@@ -200,6 +200,7 @@ def test_the_virtual_joint_alone_shows_its_states(bench: Any) -> None:
         state = decoded(client, "/joint_states", client.newest("/joint_states"))
         assert state.position == pytest.approx([0.0], abs=1e-6)
         assert set(client.channels) == {"/joint_states", "/events"}
+        assert client.info["name"] == "jointctl joint: plant"
         assert not client.services
     joint.signal(2)
     assert joint.finished(30.0).code == 0
@@ -241,12 +242,14 @@ def test_a_sweep_shows_its_states_and_stops(bench: Any) -> None:
     sweep = bench.start("sweep", config, "-y", "-o", "data.csv", "--foxglove", f"127.0.0.1:{port}")
     with FoxgloveClient(port) as client:
         client.subscribe("/joint")
+        assert client.info["name"] == "jointctl joint: sweep"
         client.until(lambda: client.messages, 60.0)
         sweep.saw("tracking")
         assert client.call("/joint/stop")["success"]
     ended = sweep.finished(60.0)
     assert ended.code == 130, ended.err
     assert "stopped by Foxglove's STOP" in ended.err
+    assert ("data.csv" in ended.out) is (bench.folder / "data.csv").exists()
     assert bench.disabled()
 
 

@@ -473,16 +473,25 @@ def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) 
     assert bench.disabled()
 
 
-def test_each_stretch_of_a_long_log_can_be_seen_and_its_axes_are_named(bench: Any, browser: Browser) -> None:
+def test_each_stretch_of_a_long_log_can_be_seen_and_its_axes_are_named(
+    bench: Any, browser: Browser, tmp_path: Path
+) -> None:
     log = bench.folder / "long.mcap"
     records = new(LogRecord, 100_000)
     records.time_ns = 1 + np.arange(100_000) * 1_000_000
     records.phase = AxisPhase.TRACKING
     records.position_rad = 0.001 * np.arange(100_000)
+    records.position_rad[-1] -= (
+        0.002  # of the last samples this one is neither the least nor the greatest: it is not drawn
+    )
     with RunLogWriter(log, {}) as writer:
         writer.write_records(records.view(np.recarray))
     _, tab, _ = page_of(bench, browser, str(log))
     tab.until(f"{LAST_s} > 99.9")
+    folder = tmp_path / "downloads"
+    tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+    tab.click("csv")
+    assert downloaded(folder / "jointctl-time.csv").decode().splitlines()[-1].startswith("99.999,")
     tab.enter("until", "30")
     tab.until(f"Math.abs({LAST_s} - 30) < 0.01")
     buttons = "[...document.querySelectorAll('[data-testid=\"view\"] button')]"

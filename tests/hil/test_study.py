@@ -207,6 +207,8 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     assert "INTERRUPTED: 1 of 2 plants" in out.getvalue()
     assert "[mrad]" in out.getvalue()
     assert "[s]" in out.getvalue()
+    assert "chatter:" in out.getvalue()
+    assert "stuck" not in out.getvalue()  # a figure that this motion does not have is not explained either
 
 
 # --- settings and controllers ---

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -43,7 +44,9 @@ _ON_CLICK = """(function listen() {
 })()"""
 # a choice shows before the server has answered: the next one, made from what is shown, would take it back
 _SHOWN_AT_ONCE = """value => { mounted_app.elements[ID].props['model-value'] = value }"""
-_ZOOMED = "(zoom => [zoom.startValue, zoom.endValue])(getElement(ID).chart.getOption().dataZoom[0])"
+# null: not cut off at that end, where samples may lie beyond the drawn ones
+_ZOOMED = """(zoom => [zoom.start > 0 ? zoom.startValue : null, zoom.end < 100 ? zoom.endValue : null])(
+  getElement(ID).chart.getOption().dataZoom[0])"""
 # the options as the element has them: functions among them are none on the way there
 _ANEW = "(element => element?.chart?.setOption(element.options, true))(getElement(ID))"
 _SAVE_PNG = """(() => {
@@ -174,7 +177,8 @@ class Chart:
     async def _save_csv(self) -> None:
         """Every sample that stands in the picture, zoom included."""
         low, high = await ui.run_javascript(_ZOOMED.replace("ID", str(self._chart.id)))
-        ui.download.content(self._seen.csv(float(low), float(high)), self._file_name("csv"))
+        ends = -math.inf if low is None else float(low), math.inf if high is None else float(high)
+        ui.download.content(self._seen.csv(*ends), self._file_name("csv"))
 
     def _save_png(self) -> None:
         script = _SAVE_PNG.replace("ID", str(self._chart.id)).replace("BEHIND", self._behind)

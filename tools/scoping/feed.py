@@ -42,7 +42,7 @@ SERVER_SILENT = (
 SCOPE = "the scope"
 OVER = "over"  # the last stage: the program ends as it should, and nothing moves any more
 LAST_WORD_S = 1.0  # without it the pages fear that the joint may move
-SERVER_ENDED = "{}'s server has ended: no page shows or stops the joint"
+SERVER_ENDED = "{}'s server has ended: no {} shows or stops the joint"
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class ScopeFeed:
             return
         self.gone = True
         self._viewers = max(self._viewers, 1)  # reported whether or not a page was open
-        ended = SERVER_ENDED.format(self._server)
+        ended = SERVER_ENDED.format(self._server, "page" if self._server == SCOPE else "client there")
         self._count_viewers(0, ended + (", braking" if self._in_charge else "; Ctrl-C or `jointctl stop` brakes"))
         if self._in_charge:
             self._ask_stop(1, f"the end of {self._server}'s server")

@@ -107,7 +107,9 @@ class FoxgloveView(ServerListener):
         host, _, port = order.place.rpartition(":")
         capabilities, services = [Capability.Time], []
         if not order.only_states:
-            capabilities += [Capability.Parameters, Capability.Services]
+            capabilities.append(Capability.Services)
+            if len(order.names) == 1:  # nobody changes the gains of an arm: a client that tries is told by the SDK
+                capabilities.append(Capability.Parameters)
             schema = ServiceSchema(
                 _TRIGGER,
                 request=_json_schema(f"{_TRIGGER}_Request", {"type": "object"}),

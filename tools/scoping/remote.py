@@ -202,9 +202,11 @@ def require_package(kind: _Kind) -> None:
 
 @contextmanager
 def remote(
-    options: ObserveOptions, config: Config | ArmConfig, output: Output, *, owner: str = "", only_states: bool = False
-) -> Iterator[Remote]:
-    """Serve what the options ask for.  `owner`: the program that the set-points of this run come from.
+    options: ObserveOptions, config: Config | ArmConfig, output: Output, *,
+    owner: str = "", motion: str = "", only_states: bool = False,
+) -> Iterator[Remote]:  # fmt: skip
+    """Serve what the options ask for.  `owner`: the program that the set-points of this run come from.  `motion`: what
+    moves, where it is not the configured trajectory.
 
     `UsageError` for options that do not go together, `DataError` where a server cannot be had.
     """
@@ -213,7 +215,8 @@ def remote(
     sources = SetPointSources(owner) if allow else None
     first, names = (config, JOINT_NAMES) if isinstance(config, Config) else (config.joints[0], config.names)
     order = RemoteOrder(
-        run_title(config), joint_name(config.path), names, first.drive.kind, "", allow_remote=allow,
+        f"{config.path.stem}: {motion}" if motion else run_title(config), joint_name(config.path), names,
+        first.drive.kind, "", allow_remote=allow,
         only_states=only_states, loop_cpu=first.loop.cpu,
     )  # fmt: skip
     with ExitStack() as stack:

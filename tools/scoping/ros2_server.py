@@ -193,7 +193,7 @@ class Ros2View:
         self._kept: list[object] = []  # what zenoh takes back when it is dropped
         self._count, self._told_s = 0, 0.0
         self._drive = session_drive(order.drive)
-        self._problem: tuple[int, str] = (_OK, "")  # the newest warning or error of the run
+        self._problems: dict[str, tuple[int, str]] = {}  # the newest warning or error, of each joint that had one
         self._refusal = ""
         self._names: dict[bytes, str] = {}
         self._lock = threading.Lock()
@@ -303,9 +303,13 @@ class Ros2View:
             self._put_diagnostics(self._diagnostics(records, wall_ns))
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
-        """See `Publisher`: the newest warning or error is in the diagnostics."""
+        """See `Publisher`: the newest warning or error is in the diagnostics, of an arm in those of its joint."""
         if event.level >= WARNING:
-            self._problem = (_ERROR if event.level >= ERROR else _WARN, f"{event.source}: {event.text}")
+            joint, _, text = event.text.partition(": ")
+            names = self._order.names
+            whose, text = ((joint,), text) if joint in names else (names, event.text)
+            found = (_ERROR if event.level >= ERROR else _WARN, f"{event.source}: {text}")
+            self._problems |= dict.fromkeys(whose, found)
 
     def settings(self) -> None:
         """See `Publisher`: they are in the diagnostics, also before the loop has records."""
@@ -328,7 +332,7 @@ class Ros2View:
         if record is None:
             return self._shown(name, _OK, WAITING, {"newest refusal": self._refusal})
         order, settings = self._order, self.view.settings
-        fault, (level, problem) = int(record["fault"]), self._problem
+        fault, (level, problem) = int(record["fault"]), self._problems.get(name, (_OK, ""))
         values: dict[str, object] = {
             "position_rad": f"{record['position_rad']:.6g}",
             "torque_Nm": f"{record['measured_torque_Nm']:.6g}",

@@ -134,7 +134,7 @@ def watched(config: Config | ArmConfig, live: ObserveOptions, output: Output, pl
     from jointctl.tools.scoping.feed import RECORDS
     from jointctl.tools.scoping.remote import remote
 
-    with remote(live, config, output, only_states=True) as others:
+    with remote(live, config, output, motion="plant", only_states=True) as others:
         if not others.feeds:
             yield
             return

@@ -50,6 +50,14 @@ _COLUMNS = (
     ("settled_share", "settled [share]"),
     ("stuck_share", "stuck [share]"),
 )
+_MEANINGS = (
+    ("rmse_mrad", "peak and RMSE as the encoder shows them"),
+    ("true_rmse_mrad", "true: of the joint itself"),
+    ("settling_s", "settling: until the error stays within 1 mrad"),
+    ("chatter_Nm", "chatter: mean change of the torque command in a cycle"),
+    ("settled_share", "settled: share of the moves after which the error is within 1 count or 20 urad from 50 ms on"),
+    ("stuck_share", "stuck: share of a creeping motion in which the joint stands"),
+)
 _BOXES = (
     "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
 )
@@ -152,15 +160,12 @@ def _columns(result: StudyResult) -> list[tuple[str, str]]:
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
     columns = _columns(result)
-    headings = [heading for _, heading in columns]
+    headings, shown = [heading for _, heading in columns], {key for key, _ in columns}
     table = Table(
         "controller",
         *(Column(heading, justify="right") for heading in (*headings, "faults")),
         title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
-        caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
-        "settling: until the error stays within 1 mrad; chatter: mean change of the torque command in a cycle; "
-        "settled: share of the moves after which the error is within 1 count or 20 urad from 50 ms on; "
-        "stuck: share of a creeping motion in which the joint stands",
+        caption="; ".join(words for key, words in _MEANINGS if key in shown),
         title_justify="left",
         caption_justify="left",
     )

@@ -289,12 +289,12 @@ class Sweep:
     def _table(self) -> Table:
         done = len(self.file.done) if self.file is not None else 0
         table = Table(title="Sweep", title_justify="left", show_header=False)
+        files = [("data", str(self.out)), ("sidecar", str(self.out.with_suffix(".json")))]
         for name, value in (
             ("points", f"{done} of {len(self.plan.points)}"),
             ("not settled", str(len(self._unsettled))),
             ("drive afterwards", self.drive_state or "none, it was simulated"),
-            ("data", str(self.out)),
-            ("sidecar", str(self.out.with_suffix(".json"))),
+            *(files if done else []),  # without one row they are removed
         ):
             table.add_row(name, value)
         return table
@@ -320,7 +320,7 @@ def sweep(
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
     with contextlib.ExitStack() as stack:
-        command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output)))
+        command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output, motion="sweep")))
         if not options.lockstep:
             command.control = stack.enter_context(in_control(command.config, output))
         try:

@@ -32,7 +32,7 @@ def _tables(job: Tune) -> tuple[Table, Table]:
     table = Table(
         "", *(Column(name, justify="right") for name in ("before", "after")), title="Loop and tracking",
         title_justify="left", caption_justify="left",
-        caption="margins of the joint that was found, worst case; error from 5 s on, as the encoder shows it",
+        caption="margins of the joint that was found, as `check` has them; error from 5 s on, as the encoder shows it",
     )  # fmt: skip
     both = [_margins_or_none(config) for config in (_before_on_found(job), job.config)]
     for name, key, form in (

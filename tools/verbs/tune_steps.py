@@ -412,7 +412,7 @@ class Tune:
         control = self.config.control
         self.carrier.output.note(
             f"  law {kept['law']}, kp {control.kp:g}, kv {control.kv:g}, "
-            f"phase margin {kept['phase_margin_deg']:.1f} deg in the worst case"
+            f"phase margin {kept['phase_margin_deg']:.1f} deg at the worst ends of the intervals"
         )
         for name in kept["missed"]:
             self.carrier.output.warning(f"this joint does not allow all: {name}")

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 
+import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from zenoh.ext import Int64, UInt8, z_serialize
 
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
 from jointctl.tools.recording.ros_messages import JOINT_STATE_TOPIC
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event
 from jointctl.tools.scoping import ros2_server as ros
+from jointctl.tools.scoping.remote import RemoteOrder
 from jointctl.tools.scoping.ros2_server import session_config, set_point_of
 from jointctl.tools.session.set_points import RemoteSetPoint
-from tests.ros2_client import DEFINITIONS, HASHES, JOINT_STATE, SET_POINT, TRIGGER, key
+from tests.ros2_client import DEFINITIONS, DIAGNOSTICS, HASHES, JOINT_STATE, SET_POINT, TRIGGER, key
 
 STORE = ros.type_store()
 
@@ -116,3 +122,27 @@ def test_zenoh_stays_on_this_computer_and_looks_for_no_one_by_multicast() -> Non
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:0"]
     assert json.loads(config.get_json("connect/endpoints")) == ["tcp/localhost:7447"]
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+
+
+def test_the_diagnostics_of_an_arm_tell_of_each_joint_what_happened_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    bodies: list[bytes] = []
+    monkeypatch.setattr(ros.Ros2View, "_publisher", lambda _, name, __: bodies.append if "diag" in name else id)
+    monkeypatch.setattr(ros, "WayBack", lambda *_: None)
+    view = ros.Ros2View(RemoteOrder("arm", "arm", ("shoulder", "elbow"), "canopen", "tcp/127.0.0.1:0"))
+    with contextlib.closing(view._session):
+        for event in (
+            Event(0, WARNING, "loop", "shoulder: held up: 13 cycles skipped"),
+            Event(0, ERROR, "drive", "elbow: EMCY 5000h: hardware"),
+            Event(0, INFO, "loop", "shoulder: ramping"),
+        ):
+            view.event(event, b"", 0)
+        view.states(np.asarray(new(LogRecord, 2)), b"", 0)
+        view.event(Event(0, WARNING, "bus", "nobody acknowledges"), b"", 0)
+        view._told_s = 0.0
+        view.states(np.asarray(new(LogRecord, 2)), b"", 0)
+    found = [
+        [(status.level, {pair.key: pair.value for pair in status.values}["newest event"]) for status in report.status]
+        for report in (STORE.deserialize_cdr(body, DIAGNOSTICS) for body in bodies)
+    ]
+    assert found[0] == [(1, "loop: held up: 13 cycles skipped"), (2, "drive: EMCY 5000h: hardware")]
+    assert found[1] == [(1, "bus: nobody acknowledges")] * 2

@@ -357,8 +357,16 @@ def test_the_end_of_the_server_brakes_what_is_led_from_the_page(
     ends[1].close()
     assert feed.stop_request() is (StopRequest.RAMP if in_charge else StopRequest.NONE)
     (told,) = feed.requests()
-    assert "server has ended" in told.values["text"]
+    assert "server has ended: no page shows" in told.values["text"]
     assert feed.requests() == []
+
+
+def test_the_end_of_another_server_is_not_called_that_of_a_page(ends: tuple[socket.socket, socket.socket]) -> None:
+    feed = ScopeFeed(ends[0], server="Foxglove", takes=frozenset())
+    ends[1].close()
+    feed.stop_request()
+    (told,) = feed.requests()
+    assert "Foxglove's server has ended: no client there shows" in told.values["text"]
 
 
 def test_nobody_watching_is_an_event_and_a_line_in_the_terminal(tmp_path: Path) -> None:

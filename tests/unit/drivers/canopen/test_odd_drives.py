@@ -141,6 +141,12 @@ def test_what_a_drive_is_refused_for_that_lacks_objects(
         lacking(*places)
 
 
+@pytest.mark.parametrize(("reference", "index"), [("rated_torque", 0x6076), ("rated_current", 0x6075)])
+def test_a_drive_without_the_rated_value_that_6071_hangs_on(lacking: Any, reference: str, index: int) -> None:
+    with pytest.raises(DeviceError, match=f"it has no object {index:04X}, so 6071 has no scale"):
+        lacking((index, None), torque_reference=reference, rated_torque_Nm=None, rated_current_A=None)
+
+
 @pytest.mark.parametrize(
     ("index", "sub", "name", "code"),
     [
