@@ -165,6 +165,7 @@ def prediction_figure(found: MotionFit) -> Any:
         lower.set_xlabel("plateau" if motion.plateaus else "time [s]")
         if not windows:
             _legend_above(axes[names[0]])
+            axes[names[0]].set_xlim(lower.get_xlim())
         else:
             axes[names[0]].legend(loc="best", fontsize="small")
         _legend_above(lower)
