@@ -94,6 +94,16 @@ def ended(dump: subprocess.Popen[str]) -> list[str]:
 
 
 @contextmanager
+def candump(*what: str) -> Iterator[subprocess.Popen[str]]:
+    """`candump -L` of these, killed at the end: what fails meanwhile would wait for it for ever."""
+    with subprocess.Popen(["candump", "-L", *what], stdout=subprocess.PIPE, text=True) as dump:
+        try:
+            yield dump
+        finally:
+            dump.kill()
+
+
+@contextmanager
 def tracking(folder: Path, config: str) -> Iterator[subprocess.Popen[str]]:
     """A `jointctl run` that has reached its trajectory."""
     command = jointctl("run", config, *ON_VCAN, *SLOW_GUEST)
@@ -126,7 +136,7 @@ def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
 @pytest.mark.usefixtures("joint")
 def test_candump_sees_the_run_and_cansend_can_stop_it(tmp_path: Path, config: str) -> None:
     assert shutil.which("candump"), "can-utils must be installed"
-    with subprocess.Popen(["candump", "-L", "vcan0"], stdout=subprocess.PIPE, text=True) as dump:
+    with candump("vcan0") as dump:
         with tracking(tmp_path, config) as started:
             subprocess.run(["cansend", "vcan0", "000#8001"], check=True)  # NMT: pre-operational, from somebody else
             assert started.wait(60.0) == 7
@@ -157,7 +167,7 @@ def test_a_stop_in_the_motion_ends_the_run(tmp_path: Path, config: str) -> None:
 @pytest.mark.usefixtures("joint")
 def test_a_stop_before_the_motion_is_final(tmp_path: Path, config: str, after_s: float) -> None:
     """The program was starting, listening, or commissioning the drive: it ends, and no frame enables afterwards."""
-    with subprocess.Popen(["candump", "-L", "vcan0,201:7FF"], stdout=subprocess.PIPE, text=True) as dump:
+    with candump("vcan0,201:7FF") as dump:
         with subprocess.Popen(
             jointctl("run", config, *ON_VCAN, *SLOW_GUEST), cwd=tmp_path, stderr=subprocess.PIPE, text=True
         ) as started:
@@ -178,9 +188,7 @@ def test_a_stop_before_the_motion_is_final(tmp_path: Path, config: str, after_s:
 def test_a_joint_that_another_master_commands_is_left_alone(tmp_path: Path, config: str) -> None:
     """SYNC every 20 ms: nothing is sent, which candump sees."""
     sync = ["cangen", "vcan0", "-g", "20", "-I", "080", "-L", "0"]
-    with subprocess.Popen(sync) as foreign, subprocess.Popen(
-        ["candump", "-L", "vcan0,080~7FF"], stdout=subprocess.PIPE, text=True
-    ) as dump:  # fmt: skip
+    with subprocess.Popen(sync) as foreign, candump("vcan0,080~7FF") as dump:
         try:
             refused = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
         finally:
