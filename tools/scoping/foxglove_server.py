@@ -108,7 +108,7 @@ class FoxgloveView(ServerListener):
         capabilities, services = [Capability.Time], []
         if not order.only_states:
             capabilities.append(Capability.Services)
-            if len(order.names) == 1:  # nobody changes the gains of an arm: a client that tries is told by the SDK
+            if len(order.names) == 1:  # nobody changes the gains of an arm: the SDK says so to a client that tries
                 capabilities.append(Capability.Parameters)
             schema = ServiceSchema(
                 _TRIGGER,

@@ -6,8 +6,9 @@
  * the drives and swings about the positions that it finds, then switches the drives off.
  *
  * exchange_loop FD PRIORITY PERIOD_ns RECEIVE_ns CYCLES DRIVES; on stdin a struct setting of each drive, all on one
- * bus, then, of an arm, its gravity[3] and a struct link of each; on stdout CYCLES rows of int64 [wake-up after the deadline, wait for the samples, work, all enabled, slots
- * skipped], times in ns, -1 for a wait in which one did not come.
+ * bus, then, of an arm, its gravity[3] and a struct link of each; on stdout CYCLES rows of int64 [wake-up after the
+ * deadline, wait for the samples, work, all enabled, slots skipped], times in ns, -1 for a wait in which one did not
+ * come.
  */
 #define _GNU_SOURCE
 #include <errno.h>
