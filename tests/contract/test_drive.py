@@ -12,6 +12,7 @@ import pytest
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.drive import Declined, Drive
 from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.elmo_line import ElmoDevice
@@ -141,12 +142,26 @@ class CanopenBench:
         self._bus.device = None
 
 
+class PatientClock:
+    """Passes slowly, so that a computer that stands still for a while is no silent drive."""
+
+    def __init__(self) -> None:
+        self._now_s = self._seen_s = time.monotonic()
+        self.pace = 0.05
+
+    def __call__(self) -> float:
+        seen_s = time.monotonic()
+        self._now_s += self.pace * (seen_s - self._seen_s)
+        self._seen_s = seen_s
+        return self._now_s
+
+
 class ElmoBench:
     """configs/elmo_serial.toml on a pseudo-terminal."""
 
-    def __init__(self, device: ElmoDevice, drive: ElmoDrive) -> None:
-        self._device = device
-        self.drive: Drive = drive
+    def __init__(self, device: ElmoDevice, settings: ElmoSettings) -> None:
+        self._device, self._clock = device, PatientClock()
+        self.drive: Drive = ElmoDrive(settings, clock=self._clock)
 
     def power_up(self) -> None:
         self._device.interpreter.execute(b"MO=1")
@@ -156,6 +171,7 @@ class ElmoBench:
 
     def fall_silent(self) -> None:
         self._device.faults.mute = True
+        self._clock.pace = 1.0
 
 
 class TestCanopenDrive(DriveContract):
@@ -191,9 +207,9 @@ class TestElmoDrive(DriveContract):
         with serve_virtual_elmo(config) as device:
             settings = elmo_settings(moved(config, GivenPlace(port=device.path)))
             # slow: a busy computer delays the virtual drive, and the measured line is not the subject here
-            drive = ElmoDrive(dataclasses.replace(settings, rate_Hz=20.0, mode=self.mode))
-            yield ElmoBench(device, drive)
-            drive.close()
+            bench = ElmoBench(device, dataclasses.replace(settings, rate_Hz=20.0, mode=self.mode))
+            yield bench
+            bench.drive.close()
 
 
 class TestElmoDriveInSpeedMode(TestElmoDrive):

@@ -176,8 +176,7 @@ def test_a_stop_before_the_motion_is_final(tmp_path: Path, config: str, after_s:
             ended_s = time.time()
             assert stopped.returncode == 0, stopped.stderr
             said = started.communicate(timeout=60.0)[1]
-            stood_still = "the loop process did nothing for" in said  # a slow guest, while `stop` loads
-            assert started.returncode == (7 if stood_still else 130), said
+            assert started.returncode == 130, said
         time.sleep(1.0)
         lines = ended(dump)
     commands = [(float(line.split()[0].strip("()")), line.split("#")[1][:4]) for line in lines]

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
+LOOK_S = 0.5  # two looks at it that lie further apart count as so much: this process, or the computer, stood still
 OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled in the meantime
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
@@ -48,6 +49,7 @@ class LoopHandle:
         self.block = new_block(table, port, arm)
         self._tail = 0
         self.lost_records = 0
+        self._cycle_ns = self._looked_ns = self._silent_ns = 0
         self._after_end = config.drive.when_the_loop_ends
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
@@ -176,6 +178,16 @@ class LoopHandle:
             return Fault.OVERRUN, held_up_ns / self._period_ns
         return Fault(int(state.fault)), float(state.fault_value)
 
+    def _silence_ns(self) -> int:
+        """How long the loop has finished no cycle while this process looked, and a processor could be had."""
+        now_ns, cycle_ns = time.monotonic_ns(), int(self.block.words[Word.LOOP_NS])
+        if cycle_ns != self._cycle_ns:
+            self._cycle_ns = self._looked_ns = cycle_ns
+            self._silent_ns = 0
+        self._silent_ns += min(now_ns - self._looked_ns, round(LOOK_S * NANOSECONDS))
+        self._looked_ns = now_ns
+        return self._silent_ns
+
     def new_records(self) -> Any:
         head = int(self.block.words[Word.HEAD])
         records, lost = self.block.new_records(self._tail, head)
@@ -192,7 +204,7 @@ class LoopHandle:
         if self.block.words[Word.ENDED]:
             return False
         if code is None:
-            silent_s = (time.monotonic_ns() - int(self.block.words[Word.LOOP_NS])) * 1e-9
+            silent_s = self._silence_ns() * 1e-9
             if silent_s <= (SILENT_S if self.block.words[Word.HEAD] else OPENING_S):
                 return True
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run

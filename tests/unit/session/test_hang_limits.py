@@ -12,16 +12,13 @@ from jointctl.firmware_py.cycle import WORDS, Word
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.session import loop_handle
 from jointctl.tools.session.elmo_drive import SPARE_S
-from jointctl.tools.session.loop_handle import OPENING_S, SILENT_S, LoopHandle
+from jointctl.tools.session.loop_handle import LOOK_S, OPENING_S, SILENT_S, LoopHandle
 
 NOW_ns = 10_000_000_000_000
 MICROSECOND_ns = 1000
+SECOND_ns = 1_000_000_000
+LOOK_ns = 20_000_000
 GUARD_SILENT_S = SILENT_S + SPARE_S
-
-
-def ago_ns(seconds: float, past_ns: int) -> int:
-    """The time of a last cycle that lies `seconds` and `past_ns` back."""
-    return NOW_ns - round(seconds * 1e9) - past_ns
 
 
 class LivingProcess:
@@ -40,25 +37,70 @@ class LivingProcess:
         return -9
 
 
+class Clock:
+    """The only clock that the handle sees."""
+
+    def __init__(self) -> None:
+        self.now_ns = NOW_ns
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(loop_handle, "time", clock)
+    return clock
+
+
+def handle_after(cycles: int) -> tuple[Any, list[int], LivingProcess]:
+    """A handle whose loop has just finished its last one of these cycles; its words and its process."""
+    words, process = [0] * WORDS, LivingProcess()
+    words[Word.GO], words[Word.HEAD], words[Word.LOOP_NS] = 1, cycles, NOW_ns
+    handle: Any = LoopHandle.__new__(LoopHandle)
+    handle.block, handle._process, handle._after_end = SimpleNamespace(words=words), process, "what follows"
+    handle._cycle_ns = handle._looked_ns = handle._silent_ns = 0
+    return handle, words, process
+
+
 @pytest.mark.trips("supervisor: the loop process", "(MICROSECOND_ns, True)")
 @pytest.mark.stays("supervisor: the loop process", "(0, False)")
 @pytest.mark.stays("serial supervisor: the loop process", "(0, False)")
 @pytest.mark.parametrize(("cycles", "limit_s"), [(0, OPENING_S), (1, SILENT_S), (100_000, SILENT_S)])
 @pytest.mark.parametrize(("past_ns", "hangs"), [(-MICROSECOND_ns, False), (0, False), (MICROSECOND_ns, True)])
 def test_the_supervisor_ends_a_loop_that_hangs_and_no_other(
-    monkeypatch: pytest.MonkeyPatch, cycles: int, limit_s: float, past_ns: int, hangs: bool
+    clock: Clock, cycles: int, limit_s: float, past_ns: int, hangs: bool
 ) -> None:
-    monkeypatch.setattr(loop_handle, "time", SimpleNamespace(monotonic_ns=lambda: NOW_ns))
-    words, process = [0] * WORDS, LivingProcess()
-    words[Word.GO], words[Word.HEAD], words[Word.LOOP_NS] = 1, cycles, ago_ns(limit_s, past_ns)
-    handle: Any = LoopHandle.__new__(LoopHandle)
-    handle.block, handle._process, handle._after_end = SimpleNamespace(words=words), process, "what follows"
+    handle, _, process = handle_after(cycles)
+    end_ns = NOW_ns + round(limit_s * SECOND_ns)
+    while clock.now_ns < end_ns - LOOK_ns:
+        clock.now_ns += LOOK_ns
+        assert handle.running()
+    clock.now_ns = end_ns + past_ns
     if hangs:
         with pytest.raises(MotionFault, match=f"the loop process did nothing for {limit_s:.1f} s and was ended"):
             handle.running()
     else:
         assert handle.running()
     assert process.killed is hangs
+
+
+def test_a_computer_that_stood_still_is_no_loop_that_hangs(clock: Clock) -> None:
+    """Nobody had a processor for 10 s: the loop gets its chance to finish a cycle, and most of its time is left."""
+    handle, words, process = handle_after(1)
+    clock.now_ns += 10 * SECOND_ns
+    assert handle.running()
+    words[Word.LOOP_NS] = clock.now_ns
+    clock.now_ns += round(SILENT_S * SECOND_ns) + MICROSECOND_ns
+    assert handle.running()
+    for _ in range(round((SILENT_S - LOOK_S) * SECOND_ns) // LOOK_ns):
+        clock.now_ns += LOOK_ns
+        assert handle.running()
+    clock.now_ns += LOOK_ns
+    with pytest.raises(MotionFault, match="did nothing"):
+        handle.running()
+    assert process.killed
 
 
 @pytest.mark.parametrize(("own", "held_up_s", "told"), [
