@@ -325,7 +325,9 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     """A reading that stands still although the reference moves on, or although the joint is pushed hard.
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
-    following error is too large.  Where the drive closes a loop itself, the torque is the one that it measures; in an
+    following error is too large.  A joint that has slid ahead of its reference stands until it is behind it again: so
+    much of the way that the reference has gone is held against the reading as it is behind, and half of it in any case.
+    Where the drive closes a loop itself, the torque is the one that it measures; in an
     arm it is what the command has beyond the arm's own.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
@@ -342,7 +344,10 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
         state.frozen_way_rad = 0.0
         state.pushed_cycles = 0
     elif state.sample_age_cycles == 0:
-        if 0.0 < limits.frozen_max_rad < abs(way_rad):
+        behind_rad = state.reference.position_rad - state.measured_position_rad
+        if way_rad < 0.0:
+            behind_rad = -behind_rad
+        if 0.0 < limits.frozen_max_rad < min(abs(way_rad), max(behind_rad, 0.5 * abs(way_rad))):
             trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
             state.pushed_cycles += 1

@@ -155,7 +155,7 @@ def test_the_way_behind_a_reading_that_stands_still(
 ) -> None:
     axis, state = stuck
     state.frozen_way_rad, state.frozen_reference_rad = way_rad - 0.25, 1.0
-    state.reference.position_rad = 1.25
+    state.reference.position_rad, state.measured_position_rad = 1.25, 1.25 - way_rad
     if how == "moves":
         state.frozen_samples = 0
     elif how == "no sample":
@@ -169,6 +169,23 @@ def test_the_way_behind_a_reading_that_stands_still(
     assert state.fault_drive_error == 0
     assert state.frozen_way_rad == (0.0 if how == "moves" else way_rad)
     assert state.frozen_reference_rad == 1.25
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize(("way_rad", "behind_rad", "trips"), [
+    (0.8, 0.5, False), (0.8, 0.501, True), (0.501, 9.0, True), (0.5, 9.0, False),
+    (1.0, -9.0, False), (1.001, -9.0, True),
+])  # fmt: skip
+def test_a_joint_that_slid_ahead_of_its_reference_may_stand_until_it_is_behind(
+    stuck: tuple[Any, Any], way_rad: float, behind_rad: float, trips: bool, direction: float
+) -> None:
+    """Not for ever: an encoder may die just then."""
+    axis, state = stuck
+    state.frozen_way_rad = direction * way_rad
+    state.measured_position_rad = -direction * behind_rad
+    check_reading(axis, state, 1)
+    assert state.fault == (Fault.POSITION_FROZEN if trips else Fault.NONE)
+    assert state.fault_value == pytest.approx(direction * way_rad if trips else 0.0)
 
 
 @pytest.mark.parametrize(("last_rad", "trips"), [(50.0, False), (50.1, True)])
