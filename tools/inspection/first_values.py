@@ -142,6 +142,17 @@ def checked(place: Place, text: str) -> tuple[Any, str]:
     return value, echo(key, text, number) if number is not None else ""
 
 
+def in_order(place: Place, value: Any, before: Mapping[Place, object]) -> None:
+    """`ValueError` in words where the limits that are known by now leave no range."""
+    known = {**before, place: value}
+    low, high = known.get(("limits", "position_min_rad")), known.get(("limits", "position_max_rad"))
+    if place[1] in ("position_min_rad", "position_max_rad") and isinstance(low, float) and isinstance(high, float):
+        if not low < high:
+            raise ValueError(
+                f"limits.position_min_rad (={low:g}) must be less than limits.position_max_rad (={high:g})"
+            )
+
+
 # --- What the drive says of itself ---
 
 

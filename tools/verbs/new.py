@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -35,6 +36,7 @@ class DriveOptions:
 
 
 NOBODY = DriveOptions()
+NOTHING: Mapping[Place, object] = MappingProxyType({})
 
 
 def new(
@@ -186,7 +188,7 @@ def _from_drive(drive: DriveOptions, text: str, folder: Path, output: Output, *,
         output.note(f"Enter takes the value in brackets; {_OPEN} leaves a value open, to be filled in later")
         for mark in marks(text):
             if mark.place not in values:
-                values |= dict(_asked(mark, found.suggested.get(mark.place), output))
+                values |= dict(_asked(mark, found.suggested.get(mark.place), output, values))
     return values
 
 
@@ -200,9 +202,11 @@ def _bus(subject: Subject) -> dict[Place, tuple[object, str]]:
     return found
 
 
-def _asked(mark: Mark, suggested: tuple[object, str] | None, output: Output) -> Iterator[tuple[Place, object]]:
-    """One question, until its answer may be; nothing if it is left open."""
-    from jointctl.tools.inspection.first_values import checked, default_of, toml_text
+def _asked(
+    mark: Mark, suggested: tuple[object, str] | None, output: Output, before: Mapping[Place, object] = NOTHING
+) -> Iterator[tuple[Place, object]]:
+    """One question, until its answer may be beside those `before`; nothing if it is left open."""
+    from jointctl.tools.inspection.first_values import checked, default_of, in_order, toml_text
 
     usual = toml_text(default_of(mark.place)) if mark.optional else ""
     default = usual if suggested is None else toml_text(suggested[0])
@@ -217,6 +221,7 @@ def _asked(mark: Mark, suggested: tuple[object, str] | None, output: Output) -> 
             return
         try:
             value, echoed = checked(mark.place, text)
+            in_order(mark.place, value, before)
         except ValueError as error:
             output.note(f"  {error}")
             continue

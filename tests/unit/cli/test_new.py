@@ -29,7 +29,7 @@ ANSWERS = {
     "drive.eds": "mine.eds", "drive.torque_reference": "rated_torque", "drive.torque_direction": "",
     "encoder.side": "", "encoder.direction": "", "encoder.zero_counts": "100", "joint.reduction_ratio": "",
     "joint.inertia_kgm2": "20000 kg cm2", "joint.torque_constant_NmpA": "", "joint.torque_constant_ampere": "",
-    "limits.position_min_rad": "-20 deg", "limits.position_max_rad": "x\n20 deg", "limits.torque_max_Nm": "20",
+    "limits.position_min_rad": "-20 deg", "limits.position_max_rad": "x\n-21 deg\n20 deg", "limits.torque_max_Nm": "20",
 }  # fmt: skip
 
 
@@ -71,6 +71,7 @@ def test_what_the_drive_says_is_taken_and_the_rest_asked_for(
     text = err.getvalue()
     assert "20 deg is read as 0.349066 rad" in text
     assert "limits.position_max_rad (=x)" in text
+    assert "limits.position_min_rad (=-0.349066) must be less than limits.position_max_rad (=-0.366519)" in text
     assert "drive.rated_current_A = 5.0 (6075)" in text
     assert "FILL IN: " not in (tmp_path / "mine.toml").read_text()
     assert {data[0] & 0xE0 for identifier, data in joint.requests if identifier == 0x601} <= {0x40, 0x60}
