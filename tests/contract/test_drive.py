@@ -109,7 +109,7 @@ class DriveContract:
         bench.fall_silent()
         began_s = time.monotonic()
         readings = [meter.poll() for _ in range(100)] if meter is not None else []
-        assert time.monotonic() - began_s < 0.2
+        assert time.monotonic() - began_s < 5.0  # an answer's time each would be 20 s
         assert all(found is None or found.temperature_degC is None for found in readings)
 
     def test_close_may_be_called_twice(self, bench: Bench) -> None:
