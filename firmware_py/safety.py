@@ -300,7 +300,14 @@ def set_point_problem(
     steep = steep or not abs(after.velocity_radps - before.velocity_radps) <= room_radps
     if steep or not abs(off_rad) <= 0.5 * room_radps * duration_s:
         return SetPointProblem.ACCELERATION
-    for d in (0.25 * duration_s, 0.5 * duration_s, 0.75 * duration_s, duration_s):
+    quickest_s, half_s = 0.0, 0.0  # where its velocity is greatest, and from there to where it turns back
+    if c3 != 0.0:
+        quickest_s = -c2 / (3.0 * c3)
+        half_s = math.sqrt(max(quickest_s * quickest_s - before.velocity_radps / (3.0 * c3), 0.0))
+    for i in range(7):
+        d = 0.25 * (i + 1) * duration_s if i < 4 else quickest_s + (i - 5) * half_s
+        if not 0.0 <= d <= duration_s:
+            continue
         way_rad = before.position_rad + d * (before.velocity_radps + d * (c2 + d * c3))
         speed_radps = before.velocity_radps + d * (2.0 * c2 + 3.0 * d * c3)
         if not within(speed_radps, -limits.velocity_max_radps, limits.velocity_max_radps):

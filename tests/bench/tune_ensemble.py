@@ -6,7 +6,8 @@
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
 reducer and two encoders) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no
 reducer, and the delay of the shipped configuration.  Simulated time.  The same law is chosen a second time from the
-true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s.  `--motions`: what
+true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s, and once more
+until 60 s, when what adapts has found its weights.  `--motions`: what
 was tuned also makes the runs of `flexible_study.py`, with learning and with adaptation, motions that never repeat.
 
 Hysteresis leaves a reducer no single stiffness.  The one that is compared is local, at the excitation's amplitude and
@@ -59,7 +60,7 @@ from jointctl.tools.tuning.tune_options import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
 from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
 
-RUN_s, FROM_s = 40.0, 20.0
+RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
 HELD_LINK = ((0.0, 1e4), (0.0, 200.0))  # of a rigid joint: a link that nothing moves
 
@@ -103,18 +104,18 @@ def wrong_guess(config: Config, seed: int, index: int) -> Config:
     return config.model_copy(update=update)
 
 
-def true_fit(config: Config, found: JointFit, true_kgm2: float) -> JointFit:
-    """As if the response had told the truth, with the intervals of the one that was measured."""
+def true_fit(
+    config: Config, found: JointFit, true_kgm2: float, local: tuple[float, float] = (0.0, 0.0)
+) -> JointFit:  # fmt: skip
+    """As if the response had told the truth, with the intervals of the one that was measured; `local_stiffness`."""
     virtual = config.virtual
     assert virtual is not None
     late_s = virtual.command_delay_s + virtual.current_lag_s
     values = {"inertia_kgm2": true_kgm2, "delay_s": virtual.command_delay_s, "lag_s": virtual.current_lag_s,
               "late_s": late_s, "friction_Nmspr": found.friction_Nmspr.value}  # fmt: skip
     if virtual.flexible:
-        motor, link = virtual.motor_side_inertia_kgm2, true_kgm2 - virtual.motor_side_inertia_kgm2
-        stiffness = SMALL_MOTION * virtual.reducer_stiffness_Nmprad
-        resonance = math.sqrt(stiffness * (1.0 / motor + 1.0 / link)) / math.tau
-        values |= {"link_kgm2": link, "stiffness_Nmprad": stiffness, "resonance_Hz": resonance,
+        link = true_kgm2 - virtual.motor_side_inertia_kgm2
+        values |= {"link_kgm2": link, "stiffness_Nmprad": local[0], "resonance_Hz": local[1],
                    "damping_Nmspr": virtual.reducer_damping_Nmspr}  # fmt: skip
     estimates = {name: Estimate(values.get(name, 0.0), one.half) for name, one in found.values.items()}
     return JointFit(virtual.flexible, estimates, found.period_s, found.rms, found.lines, found.criterion)
@@ -185,12 +186,16 @@ def local_stiffness(config: Config, true_kgm2: float, job: Tune) -> tuple[float,
     return stiffness, replace(joint, stiffness_Nmprad=stiffness).resonance_Hz
 
 
-def rmse_mrad(config: Config) -> float:
-    """Of the link itself; nan where a fault ended the run."""
+def rmse_mrad(config: Config) -> tuple[float, float]:
+    """Of the link itself, before and after `LATE_s`; nan where a fault ended the run."""
     trajectory = config.trajectory.model_copy(update={"duration_s": RUN_s})
     run = LockstepJoint(config.model_copy(update={"trajectory": trajectory})).run()
-    rows = run.tracking & (run.log.trajectory_s >= FROM_s)
-    return math.nan if run.fault else 1e3 * float(np.sqrt(np.mean(run.true_error_rad[rows] ** 2)))
+    if run.fault:
+        return math.nan, math.nan
+    time_s, error_mrad = run.log.trajectory_s, 1e3 * run.true_error_rad
+    parts = (run.tracking & (FROM_s <= time_s) & (time_s < LATE_s), run.tracking & (time_s >= LATE_s))
+    early, late = (float(np.sqrt(np.mean(error_mrad[rows] ** 2))) for rows in parts)
+    return early, late
 
 
 def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
@@ -219,11 +224,12 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
     row["late_ms_half"] = 1e3 * fit.late_s.half
     row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
+    local = local_stiffness(plant, true_kgm2, job) if soft else (0.0, 0.0)
     if soft:
         link = true_kgm2 - virtual.motor_side_inertia_kgm2
         row["link"] = fit.link_kgm2.value / link - 1.0
         row["stiffness_over_first"] = fit.stiffness_Nmprad.value / virtual.reducer_stiffness_Nmprad
-        stiffness, resonance_Hz = local_stiffness(plant, true_kgm2, job)
+        stiffness, resonance_Hz = local
         row["stiffness"] = fit.stiffness_Nmprad.value / stiffness - 1.0
         row["resonance"] = fit.resonance_Hz.value / resonance_Hz - 1.0
         row |= {"stiffness_half": fit.stiffness_Nmprad.half / stiffness, "link_half": fit.link_kgm2.half / link}
@@ -232,15 +238,15 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     row["missed"] = "; ".join(job.state["gains"]["missed"])
     row["believed_margin_deg"] = job.state["gains"]["phase_margin_deg"]
     row["true_margin_deg"] = true_margin_deg(job.config, true_kgm2)
-    row["rmse_mrad"] = rmse_mrad(job.config)
+    row["rmse_mrad"], row["late_rmse_mrad"] = rmse_mrad(job.config)
     row["rmse_before_mrad"] = job.state["verification"].get("before", {}).get("rmse_mrad", math.nan)
-    truth = true_fit(plant, fit, true_kgm2)
+    truth = true_fit(plant, fit, true_kgm2, local)
     known = with_values(job.config, values_of_fit(job.config, truth, ""))
     assert plant.friction is not None
     friction = scaled(plant.friction, virtual.friction_positive_scale, virtual.friction_negative_scale)
     known = known.model_copy(update={"friction": friction})
     best = choose_gains(known, truth, row["law"])
-    row["rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
+    row["rmse_true_mrad"], row["late_rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
     if motions:
         control = job.config.control.model_copy(update={"learning": None, "adaptation": None})
         chosen = Controller("tuned", control, job.config.friction)
@@ -279,6 +285,7 @@ def main() -> None:
     good = [row for row in rows if "failed" not in row]
     for row in good:
         row["ratio"] = row["rmse_mrad"] / row["rmse_true_mrad"]
+        row["late_ratio"] = row["late_rmse_mrad"] / row["late_rmse_true_mrad"]
     if given.csv is not None:
         with given.csv.open("w", newline="") as file:
             writer = csv.DictWriter(file, sorted({key for row in rows for key in row}))
@@ -286,11 +293,13 @@ def main() -> None:
             writer.writerows(rows)
     print(f"{len(good)} of {len(rows)} tuned, seed {given.seed}, {'soft' if given.soft else 'rigid'}; simulated")
     for name in ("inertia", "link", "resonance", "stiffness", "stiffness_over_first", "late_ms", "rmse_mrad",
-                 "rmse_true_mrad", "ratio", "joint_s", "cpu_s"):  # fmt: skip
+                 "rmse_true_mrad", "ratio", "late_rmse_mrad", "late_rmse_true_mrad", "late_ratio", "joint_s",
+                 "cpu_s"):  # fmt: skip
         print(f"  {name}: {_figures(good, name)}")
     margins_deg = sorted(row["true_margin_deg"] for row in good)
     print(f"  true phase margin: worst {margins_deg[0]:.1f}, 30 deg and more {sum(m >= 30.0 for m in margins_deg)}")
-    print(f"  ratio at most 1.2: {sum(row['ratio'] <= 1.2 for row in good)}")
+    for name in ("ratio", "late_ratio"):
+        print(f"  {name} at most 1.2: {sum(row[name] <= 1.2 for row in good)}")
     for name in ("inertia", "link", "resonance", "stiffness", "late_ms"):
         some = [row for row in good if name in row]
         if some:

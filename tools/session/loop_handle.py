@@ -41,6 +41,8 @@ class LoopHandle:
     when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
+    _cycle_ns = _looked_ns = _silent_ns = 0  # of `_silence_ns`
+
     def __init__(
         self, config: Config, table: np.ndarray, port: type, tail_path: Path | None = None,
         marker_fds: Sequence[int] = (), arm: ArmModel | None = None, joints: Sequence[Config] = (),
@@ -49,7 +51,6 @@ class LoopHandle:
         self.block = new_block(table, port, arm)
         self._tail = 0
         self.lost_records = 0
-        self._cycle_ns = self._looked_ns = self._silent_ns = 0
         self._after_end = config.drive.when_the_loop_ends
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(

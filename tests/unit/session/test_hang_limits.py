@@ -60,7 +60,6 @@ def handle_after(cycles: int) -> tuple[Any, list[int], LivingProcess]:
     words[Word.GO], words[Word.HEAD], words[Word.LOOP_NS] = 1, cycles, NOW_ns
     handle: Any = LoopHandle.__new__(LoopHandle)
     handle.block, handle._process, handle._after_end = SimpleNamespace(words=words), process, "what follows"
-    handle._cycle_ns = handle._looked_ns = handle._silent_ns = 0
     return handle, words, process
 
 

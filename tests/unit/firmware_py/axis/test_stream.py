@@ -335,7 +335,10 @@ def test_a_set_point_exactly_as_steep_as_allowed_is_none_too_steep() -> None:
 
 
 def test_the_way_between_two_set_points_is_that_of_hermites_cubic() -> None:
-    """Speed and stopping way at each quarter, against another implementation of the cubic, close to the limits."""
+    """Speed and stopping way at each quarter, where it is quickest and where it turns back, close to the limits.
+
+    Against another implementation of the cubic.
+    """
     random, rig = np.random.default_rng(20), Rig()
     limits = rig.axis.limits
     limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 1.0
@@ -347,19 +350,20 @@ def test_the_way_between_two_set_points_is_that_of_hermites_cubic() -> None:
         way_rad = duration_s * speeds_radps.mean() + random.uniform(-9.0, 9.0) * duration_s**2
         start_rad = random.uniform(0.2, 0.5)
         cubic = CubicHermiteSpline([0.0, duration_s], [start_rad, start_rad + way_rad], speeds_radps)
-        expected = Problem.NONE
-        for at_s in duration_s * np.array([0.25, 0.5, 0.75, 1.0]):
+        inside_s = [*cubic.derivative(1).roots(extrapolate=False), *cubic.derivative(2).roots(extrapolate=False)]
+        expected = set()
+        for at_s in (*(duration_s * np.array([0.25, 0.5, 0.75, 1.0])), *inside_s):
             speed_radps = float(cubic(at_s, 1))
             if abs(speed_radps) > 1.0:
-                expected = Problem.VELOCITY
-                break
-            if reference_fault(limits, float(cubic(at_s)), speed_radps, 0.0, 0.0, 20.0, DELAY_ms * 1e-3) != Fault.NONE:
-                expected = Problem.STOPPING_WAY
-                break
+                expected.add(Problem.VELOCITY)
+            elif (
+                reference_fault(limits, float(cubic(at_s)), speed_radps, 0.0, 0.0, 20.0, DELAY_ms * 1e-3) != Fault.NONE
+            ):
+                expected.add(Problem.STOPPING_WAY)
         points = ((start_rad, speeds_radps[0], 0.0), (start_rad + way_rad, speeds_radps[1], 0.0))
         told = problem(*points, ms=1e3 * duration_s)
         if told not in (Problem.POSITION, Problem.JUMP, Problem.ACCELERATION):
-            assert told is expected, points
+            assert told in (expected or {Problem.NONE}), points
             found[told] += 1
     assert min(found[told] for told in (Problem.NONE, Problem.VELOCITY, Problem.STOPPING_WAY)) > 100
 
@@ -385,6 +389,18 @@ def test_a_velocity_between_two_set_points_counts_too() -> None:
     assert problem((0.0, 0.95, 0.0), (0.036, 0.95, 0.0)) is Problem.VELOCITY
 
 
+@pytest.mark.parametrize(("highest", "expected"), [(0.9995, NONE), (1.0005, Problem.VELOCITY)])
+@pytest.mark.parametrize("at", [0.1, 0.4, 0.9])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_the_greatest_velocity_between_two_set_points_counts_wherever_it_is(
+    highest: float, expected: Problem, at: float, direction: float
+) -> None:
+    """highest - 0.1 (share - at)^2: at each quarter of the way the velocity is less than the limit of 1 rad/s."""
+    first, last = highest - 0.1 * at**2, highest - 0.1 * (1.0 - at) ** 2
+    way = 0.03 * (highest - 0.1 * (at**3 + (1.0 - at) ** 3) / 3.0)
+    assert problem((0.0, direction * first, 0.0), (direction * way, direction * last, 0.0)) is expected
+
+
 numbers = st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
 
 
@@ -404,7 +420,8 @@ def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple
             assert -0.5 <= reference.position_rad <= 0.5
             assert abs(reference.velocity_radps) <= 2.0
             assert abs(float(run.state.stream.torque_Nm)) <= 5.0
-            assert run.state.fault == Fault.NONE
+            # a joint that cannot follow so quickly makes up for it later, quicker than its reference
+            assert run.state.fault in (Fault.NONE, Fault.VELOCITY_LIMIT)
 
 
 def test_between_two_set_points_it_is_the_cubic() -> None:
