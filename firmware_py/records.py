@@ -403,7 +403,9 @@ class LimitConstants:
     following_error_max_rad: f8
     position_jump_max_rad: f8  # between two consecutive samples
     frozen_max_rad: f8  # way of the reference while the reading stands still; 0 = not watched
+    frozen_ahead_rad: f8  # of that way, so much at most does not count while the joint is ahead of its reference
     frozen_torque_Nm: f8  # that a healthy joint would not stand still under; 0 = not watched
+    frozen_bias_Nm: f8  # what it takes to hold it where it stands; that torque pushes no joint
     frozen_tolerance_rad: f8  # a reading that changes by no more stands still
     sample_age_max_cycles: i8
     heartbeat_age_max_cycles: i8  # of the drive's own heartbeat; 0 = not watched

@@ -38,6 +38,7 @@ TORQUE_SWINGS = 4
 ERROR_SWINGS = 6
 GROWING_SWINGS = 8
 REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
+ROUNDING_radps = 1e-9  # of a desired velocity that is the limit
 ROUNDING_rad = 1e-12  # of a desired position: a motion that ends at a limit is not beyond it
 LOOK_AHEAD_rad = 1e-5  # at most so much is allowed for the jerk of a desired motion that comes to rest at a limit
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
@@ -253,7 +254,7 @@ def reference_fault(
     turning_rad = min(abs(jerk_radps3) * ahead_s * ahead_s * ahead_s, LOOK_AHEAD_rad)
     if not within(stop_rad, low_rad - turning_rad, high_rad + turning_rad):
         return Fault.REFERENCE_LIMIT
-    if not within(velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
+    if not abs(velocity_radps) <= limits.velocity_max_radps + ROUNDING_radps:
         return Fault.REFERENCE_LIMIT
     return Fault.NONE
 
@@ -300,17 +301,24 @@ def set_point_problem(
     steep = steep or not abs(after.velocity_radps - before.velocity_radps) <= room_radps
     if steep or not abs(off_rad) <= 0.5 * room_radps * duration_s:
         return SetPointProblem.ACCELERATION
-    quickest_s, half_s = 0.0, 0.0  # where its velocity is greatest, and from there to where it turns back
+    # where its velocity is greatest, and where it turns back: roots of v0 + 2 c2 d + 3 c3 d^2, the nearer one without
+    # a difference of large numbers
+    quickest_s = turn_s = other_turn_s = duration_s
     if c3 != 0.0:
         quickest_s = -c2 / (3.0 * c3)
-        half_s = math.sqrt(max(quickest_s * quickest_s - before.velocity_radps / (3.0 * c3), 0.0))
-    for i in range(7):
-        d = 0.25 * (i + 1) * duration_s if i < 4 else quickest_s + (i - 5) * half_s
-        if not 0.0 <= d <= duration_s:
+    under_root = c2 * c2 - 3.0 * c3 * before.velocity_radps
+    if under_root >= 0.0:
+        larger = -(c2 + math.copysign(math.sqrt(under_root), c2))
+        if larger != 0.0:
+            turn_s = before.velocity_radps / larger
+        if c3 != 0.0:
+            other_turn_s = larger / (3.0 * c3)
+    for d in (0.25 * duration_s, 0.5 * duration_s, 0.75 * duration_s, duration_s, quickest_s, turn_s, other_turn_s):
+        if not 0.0 < d <= duration_s:
             continue
         way_rad = before.position_rad + d * (before.velocity_radps + d * (c2 + d * c3))
         speed_radps = before.velocity_radps + d * (2.0 * c2 + 3.0 * d * c3)
-        if not within(speed_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
+        if not abs(speed_radps) <= limits.velocity_max_radps + ROUNDING_radps:
             return SetPointProblem.VELOCITY
         if reference_fault(limits, way_rad, speed_radps, 0.0, 0.0, brake_radps2, stream.delay_ns * 1e-9) != Fault.NONE:
             return SetPointProblem.STOPPING_WAY
@@ -332,9 +340,9 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     """A reading that stands still although the reference moves on, or although the joint is pushed hard.
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
-    following error is too large.  A joint that has slid ahead of its reference stands until it is behind it again: so
-    much of the way that the reference has gone is held against the reading as it is behind, and half of it in any case.
-    Where the drive closes a loop itself, the torque is the one that it measures; in an
+    following error is too large.  A joint that has slid ahead of its reference stands until it is behind it again: of
+    the way that the reference has gone, as much as it is behind is held against the reading, and what is beyond
+    `frozen_ahead_rad` in any case.  Where the drive closes a loop itself, the torque is the one that it measures; in an
     arm it is what the command has beyond the arm's own.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
@@ -344,6 +352,7 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
         torque_Nm = state.measured_torque_Nm
     elif constants.law.of_arm != 0:
         torque_Nm -= state.law.arm_torque_Nm  # what the other joints' motion asks for pushes no joint
+    torque_Nm -= limits.frozen_bias_Nm
     state.frozen_way_rad += (state.reference.position_rad - state.frozen_reference_rad) / elapsed_cycles
     state.frozen_reference_rad = state.reference.position_rad
     way_rad = state.frozen_way_rad
@@ -354,7 +363,8 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
         behind_rad = state.reference.position_rad - state.measured_position_rad
         if way_rad < 0.0:
             behind_rad = -behind_rad
-        if 0.0 < limits.frozen_max_rad < min(abs(way_rad), max(behind_rad, 0.5 * abs(way_rad))):
+        held_against_rad = min(abs(way_rad), max(behind_rad, abs(way_rad) - limits.frozen_ahead_rad))
+        if 0.0 < limits.frozen_max_rad < held_against_rad:
             trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
             state.pushed_cycles += 1

@@ -104,10 +104,8 @@ def wrong_guess(config: Config, seed: int, index: int) -> Config:
     return config.model_copy(update=update)
 
 
-def true_fit(
-    config: Config, found: JointFit, true_kgm2: float, local: tuple[float, float] = (0.0, 0.0)
-) -> JointFit:  # fmt: skip
-    """As if the response had told the truth, with the intervals of the one that was measured; `local_stiffness`."""
+def true_fit(config: Config, found: JointFit, true_kgm2: float, local: tuple[float, float, float]) -> JointFit:
+    """As if the response had told the truth, with the intervals of the one that was measured; `local_reducer`."""
     virtual = config.virtual
     assert virtual is not None
     late_s = virtual.command_delay_s + virtual.current_lag_s
@@ -116,7 +114,7 @@ def true_fit(
     if virtual.flexible:
         link = true_kgm2 - virtual.motor_side_inertia_kgm2
         values |= {"link_kgm2": link, "stiffness_Nmprad": local[0], "resonance_Hz": local[1],
-                   "damping_Nmspr": virtual.reducer_damping_Nmspr}  # fmt: skip
+                   "damping_Nmspr": local[2]}  # fmt: skip
     estimates = {name: Estimate(values.get(name, 0.0), one.half) for name, one in found.values.items()}
     return JointFit(virtual.flexible, estimates, found.period_s, found.rms, found.lines, found.criterion)
 
@@ -143,8 +141,8 @@ NEAR_octaves = 1.0 / 3.0
 SETTLED = 12  # times that stiffness and twist follow each other
 
 
-def local_stiffness(config: Config, true_kgm2: float, job: Tune) -> tuple[float, float]:
-    """(stiffness [Nm/rad], resonance [Hz]) at the amplitude of the excitation; see the module."""
+def local_reducer(config: Config, true_kgm2: float, job: Tune) -> tuple[float, float, float]:
+    """(stiffness [Nm/rad], resonance [Hz], damping [Nm s/rad]) at the amplitude of the excitation; see the module."""
     virtual = config.virtual
     assert virtual is not None
     assert job.response is not None
@@ -183,7 +181,7 @@ def local_stiffness(config: Config, true_kgm2: float, job: Tune) -> tuple[float,
         more, loss = np.linalg.lstsq(columns, np.concatenate((slid.real, slid.imag)), rcond=None)[0]
         stiffness = first * (1.0 + more)
         damping = virtual.reducer_damping_Nmspr + first * loss
-    return stiffness, replace(joint, stiffness_Nmprad=stiffness).resonance_Hz
+    return stiffness, replace(joint, stiffness_Nmprad=stiffness).resonance_Hz, damping
 
 
 def rmse_mrad(config: Config) -> tuple[float, float]:
@@ -224,12 +222,12 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
     row["late_ms_half"] = 1e3 * fit.late_s.half
     row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
-    local = local_stiffness(plant, true_kgm2, job) if soft else (0.0, 0.0)
+    local = local_reducer(plant, true_kgm2, job) if soft else (0.0, 0.0, 0.0)
     if soft:
         link = true_kgm2 - virtual.motor_side_inertia_kgm2
         row["link"] = fit.link_kgm2.value / link - 1.0
         row["stiffness_over_first"] = fit.stiffness_Nmprad.value / virtual.reducer_stiffness_Nmprad
-        stiffness, resonance_Hz = local
+        stiffness, resonance_Hz, _ = local
         row["stiffness"] = fit.stiffness_Nmprad.value / stiffness - 1.0
         row["resonance"] = fit.resonance_Hz.value / resonance_Hz - 1.0
         row |= {"stiffness_half": fit.stiffness_Nmprad.half / stiffness, "link_half": fit.link_kgm2.half / link}

@@ -118,6 +118,7 @@ def true(column: int, rows: Any, value: Any) -> Any:
         (true(1, 399, 0.03), "not off and at rest"),
         (true(TRUE_POWER_STATE, slice(300, 310), PowerState.OPERATION_ENABLED), "enabled again 51 ms after"),
         (set_("request", slice(260, 270), DriveRequest.ENABLE), "asked to enable again"),
+        (set_("request", slice(200, 210), DriveRequest.PREPARE), "asked to enable again"),
         (lambda run: setattr(run.state, "phase", AxisPhase.DISABLING), "did not finish"),
     ],
 )

@@ -342,6 +342,7 @@ def _fill_limits(record: LimitConstants, config: Config) -> None:
             record.limit_source = LimitSource.LAW if second.limits == second.law else LimitSource.OTHER
     record.frozen_tolerance_rad = FROZEN_COUNTS * law_resolution_rad(config)
     record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
+    record.frozen_ahead_rad = record.frozen_max_rad
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
     record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)

@@ -46,7 +46,9 @@ TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
 # The spring reaches the limit at 0.7 of the travel.  Friction that takes half of the limit lets go at 0.36; on the way
 # back the spring has to turn round first, and it takes twice that, with friction as strong as the push 1.07 travels.
 SPRING_SHARE = 1.4  # of the torque limit that gravity leaves, at full travel
-PUSH_SHARE = 0.75  # of it: a joint that stands still under that is stuck, or its reading is
+PUSH_SHARE = 0.75  # of it, and gravity, which may be believed wrongly: a joint that stands still under more is stuck
+MOST_SPRING = 0.8  # of what the spring comes to: with much gravity that is less
+PUSHED_FRICTION = 1.4  # static frictions at least: friction may be greater than configured
 MOST_PUSH = 0.95  # of the torque limit, where gravity takes nearly all of it
 STANDING_WAY = 1.2  # travels of the reference past a reading that stands still
 DAMPING = 0.5
@@ -69,6 +71,14 @@ class CheckPlan:
     def spring_Nm(self) -> float:
         """What gravity leaves of the torque."""
         return max(self.torque_Nm - self.gravity_Nm, 0.2 * self.torque_Nm)
+
+    @property
+    def pushed_Nm(self) -> float:
+        """On top of what holds it: a joint that stands still under that is stuck, or its reading is."""
+        wrong_Nm = PUSH_SHARE * self.spring_Nm + self.gravity_Nm  # gravity may not be what is believed
+        push_Nm = min(wrong_Nm, MOST_SPRING * SPRING_SHARE * self.spring_Nm)
+        friction_Nm = PUSHED_FRICTION * (self.static_friction_Nm or 0.0)
+        return min(max(push_Nm, friction_Nm), MOST_PUSH * self.torque_Nm)
 
     @property
     def ramp_s(self) -> float:
@@ -188,8 +198,10 @@ class CheckMotion:
         axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
         axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
         axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
-        axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
-        axis.limits.frozen_torque_Nm = min(plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm, MOST_PUSH * plan.torque_Nm)
+        axis.limits.frozen_max_rad, axis.limits.frozen_ahead_rad = STANDING_WAY * plan.travel_rad, 0.0
+        lever = math.sin(start_rad - config.joint.gravity_zero_rad)  # it hardly changes over the travel
+        axis.limits.frozen_bias_Nm = config.joint.gravity_Nm * lever
+        axis.limits.frozen_torque_Nm = plan.pushed_Nm
         return constants
 
 

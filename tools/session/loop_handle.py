@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
-LOOK_S = 0.5  # two looks at it that lie further apart count as so much: this process, or the computer, stood still
+LOOK_S = 0.5  # between two looks; beyond it this process or the computer stood still, which is forgiven once a cycle
 OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled in the meantime
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
@@ -41,7 +41,7 @@ class LoopHandle:
     when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
-    _cycle_ns = _looked_ns = _silent_ns = 0  # of `_silence_ns`
+    _cycle_ns = _looked_ns = _stood_ns = 0  # of `_hung_ns`
 
     def __init__(
         self, config: Config, table: np.ndarray, port: type, tail_path: Path | None = None,
@@ -179,15 +179,18 @@ class LoopHandle:
             return Fault.OVERRUN, held_up_ns / self._period_ns
         return Fault(int(state.fault)), float(state.fault_value)
 
-    def _silence_ns(self) -> int:
-        """How long the loop has finished no cycle while this process looked, and a processor could be had."""
+    def _hung_ns(self) -> int:
+        """How long the loop has finished no cycle, less the longest standstill between two looks at it.
+
+        For a cycle it needs a processor, as the looks do.
+        """
         now_ns, cycle_ns = time.monotonic_ns(), int(self.block.words[Word.LOOP_NS])
         if cycle_ns != self._cycle_ns:
             self._cycle_ns = self._looked_ns = cycle_ns
-            self._silent_ns = 0
-        self._silent_ns += min(now_ns - self._looked_ns, round(LOOK_S * NANOSECONDS))
+            self._stood_ns = 0
+        self._stood_ns = max(self._stood_ns, now_ns - self._looked_ns - round(LOOK_S * NANOSECONDS))
         self._looked_ns = now_ns
-        return self._silent_ns
+        return now_ns - cycle_ns - self._stood_ns
 
     def new_records(self) -> Any:
         head = int(self.block.words[Word.HEAD])
@@ -205,9 +208,9 @@ class LoopHandle:
         if self.block.words[Word.ENDED]:
             return False
         if code is None:
-            silent_s = self._silence_ns() * 1e-9
-            if silent_s <= (SILENT_S if self.block.words[Word.HEAD] else OPENING_S):
+            if self._hung_ns() <= NANOSECONDS * (SILENT_S if self.block.words[Word.HEAD] else OPENING_S):
                 return True
+            silent_s = (time.monotonic_ns() - self._cycle_ns) / NANOSECONDS
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run
             with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it
                 self._process.wait(KILL_S)

@@ -369,6 +369,21 @@ def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, s
     assert abs(float(plant.joint_position_rad) - records.position_rad[0]) < 0.1
 
 
+@pytest.mark.parametrize("gravity_Nm", [0.0, 20.0, 35.0])
+@pytest.mark.parametrize("at_s", [0.2, 1.2])
+def test_behind_a_dead_encoder_the_joint_is_not_pushed_on_whatever_gravity(
+    tmp_path: Path, gravity_Nm: float, at_s: float
+) -> None:
+    """What holds the joint is no push: as one it hid the spring's until the joint had swung by 0.4 rad and more."""
+    config = config_with(tmp_path, joint__gravity_Nm=gravity_Nm, virtual__gravity_Nm=gravity_Nm)
+    plan, stuck = make_plan(config, None), one_fault(FaultKind.ENCODER_STUCK, at_s)
+    records, plant, fault = check_in_lockstep(LockstepJoint(config), config, plan, stuck, tail_s=0.2)
+    assert fault is Fault.POSITION_FROZEN
+    assert abs(float(plant.joint_position_rad) - records.position_rad[0]) < 0.2
+    _, _, healthy = check_in_lockstep(LockstepJoint(config), config, plan)
+    assert healthy is Fault.NONE
+
+
 def test_the_records_name_the_encoder_that_stood(tmp_path: Path) -> None:
     config = config_with(tmp_path, {**NODE, "law": "encoder"})
     _, records, _ = checked(config)

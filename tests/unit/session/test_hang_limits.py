@@ -97,7 +97,7 @@ def test_a_computer_that_stood_still_is_no_loop_that_hangs(clock: Clock) -> None
         clock.now_ns += LOOK_ns
         assert handle.running()
     clock.now_ns += LOOK_ns
-    with pytest.raises(MotionFault, match="did nothing"):
+    with pytest.raises(MotionFault, match=r"did nothing for 3\.5 s"):
         handle.running()
     assert process.killed
 
@@ -115,3 +115,14 @@ def test_a_loop_that_stood_still_and_then_obeyed_the_guard_was_not_stopped_by_it
     state = SimpleNamespace(fault=own, fault_value=7.0 if own else 0.0)
     handle.block, handle._period_ns = SimpleNamespace(words=words, state=[state]), 1_000_000
     assert handle.verdict() == told
+
+
+@pytest.mark.parametrize(("look_s", "after_s"), [(0.1, 2.1), (0.6, 2.4), (1.0, 3.0), (1.5, 4.5)])
+def test_one_standstill_is_forgiven_and_not_a_slow_supervisor(clock: Clock, look_s: float, after_s: float) -> None:
+    handle, _, _ = handle_after(1)
+    while clock.now_ns < NOW_ns + round((after_s - look_s) * SECOND_ns) - LOOK_ns:
+        clock.now_ns += round(look_s * SECOND_ns)
+        assert handle.running()
+    clock.now_ns += round(look_s * SECOND_ns)
+    with pytest.raises(MotionFault, match=f"did nothing for {after_s:.1f} s"):
+        handle.running()

@@ -15,6 +15,7 @@ from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import LimitConstants
 from jointctl.firmware_py.safety import (
     ROUNDING_rad,
+    ROUNDING_radps,
     drive_fault,
     encoders_disagree,
     limit_position_rad,
@@ -55,8 +56,8 @@ LIMITED: list[tuple[str, Fault, float, float, Check]] = [
     (
         "reference velocity",
         Fault.REFERENCE_LIMIT,
-        -1.5,
-        1.5,
+        -1.5 - ROUNDING_radps,
+        1.5 + ROUNDING_radps,
         lambda v: reference_fault(LIMITS, 0.0, v, 0.0, 0.0, 1e9, 0.0),
     ),
 ]
@@ -75,7 +76,7 @@ def test_each_limit_is_dense_at_its_boundary(name: str, fault: Fault, low: float
             assert check(limit + math.copysign(k * 1e-4, outward)) == fault
             assert check(limit - math.copysign(k * 1e-4, outward)) == Fault.NONE
     for k in range(101):
-        assert check(low + (high - low) * k / 100.0) == Fault.NONE
+        assert check(min(low + (high - low) * k / 100.0, high)) == Fault.NONE
 
 
 @pytest.mark.parametrize(("name", "fault", "low", "high", "check"), LIMITED, ids=[c[0] for c in LIMITED])

@@ -401,6 +401,31 @@ def test_the_greatest_velocity_between_two_set_points_counts_wherever_it_is(
     assert problem((0.0, direction * first, 0.0), (direction * way, direction * last, 0.0)) is expected
 
 
+def test_a_set_point_may_cruise_at_the_limit_and_turn_at_it() -> None:
+    """Rounding is no excess: offsets that make the cubic's velocity a little greater than the limit."""
+    for k in range(200):
+        at_rad = -0.4 + 0.003 * k
+        assert problem((at_rad, 1.0, 0.0), (at_rad + 0.01, 1.0, 0.0), ms=10.0) in (NONE, Problem.STOPPING_WAY)
+
+
+@pytest.mark.parametrize("cubic", [0.0, 1e-13, -1e-13, 1e-9])
+@pytest.mark.parametrize(("end_rad", "expected"), [(0.4999, NONE), (0.5001, Problem.STOPPING_WAY)])
+def test_a_parabola_turns_back_inside_the_limits(cubic: float, end_rad: float, expected: Problem) -> None:
+    """Constant acceleration through a reversal, 0.3 of the way, with what rounding makes of it; no look ahead."""
+    run = Rig()
+    limits = run.axis.limits
+    limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 1.0
+    set_limits(run.axis.stream)
+    run.axis.stream.delay_ns, run.axis.stream.timeout_ns = MS // 1000, 200 * MS
+    points, slope, turn_s = new(SetPoint, 2), 4.0, 0.06
+    for point, at_s in zip(points, (0.0, 0.2), strict=True):
+        point.time_ns = round(at_s * 1e9)
+        point.position_rad = end_rad - 0.5 * slope * (at_s - turn_s) ** 2 + cubic * at_s**3
+        point.velocity_radps = -slope * (at_s - turn_s) + 3.0 * cubic * at_s**2
+        point.acceleration_radps2 = math.nan
+    assert set_point_problem(limits, run.axis.stream, 1000.0, points[0], points[1]) == expected
+
+
 numbers = st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
 
 
@@ -420,8 +445,11 @@ def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple
             assert -0.5 <= reference.position_rad <= 0.5
             assert abs(reference.velocity_radps) <= 2.0
             assert abs(float(run.state.stream.torque_Nm)) <= 5.0
-            # a joint that cannot follow so quickly makes up for it later, quicker than its reference
-            assert run.state.fault in (Fault.NONE, Fault.VELOCITY_LIMIT)
+            if (
+                run.state.fault == Fault.VELOCITY_LIMIT
+            ):  # of a joint that lags and makes up for it, not of the reference
+                return
+            assert run.state.fault == Fault.NONE
 
 
 def test_between_two_set_points_it_is_the_cubic() -> None:

@@ -181,6 +181,7 @@ def test_a_joint_that_slid_ahead_of_its_reference_may_stand_until_it_is_behind(
 ) -> None:
     """Not for ever: an encoder may die just then."""
     axis, state = stuck
+    axis.limits.frozen_ahead_rad = 0.5
     state.frozen_way_rad = direction * way_rad
     state.measured_position_rad = -direction * behind_rad
     check_reading(axis, state, 1)
