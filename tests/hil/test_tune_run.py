@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.recording.run_log_reader import read_run_log
+
+LATE_CYCLES = 5  # far more than the delay that is measured
 
 
 @pytest.fixture
@@ -62,10 +65,27 @@ def test_ctrl_c_in_the_response_ramps_down_and_keeps_the_steps_before(joint: Any
     assert '"direction"' in (joint.folder / "mine.tune" / "steps.json").read_text()
 
 
+def held_up(joint: Any, done: Any) -> bool:
+    """Whether the computer stood still: legs were lost, or the drive had not answered for cycles before the fault."""
+    if "legs that were measured" in done.err:
+        return True
+    newest = max((joint.folder / "runs").glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+    return "LIMIT_CYCLE" in done.err and int(read_run_log(newest).records.sample_age_cycles[-1000:].max()) > LATE_CYCLES
+
+
 @pytest.mark.slow("eight minutes of motion")
 def test_a_whole_tune_in_real_time(joint: Any) -> None:
+    """Its gains are for the delay that was measured: samples that are tens of milliseconds old end it in a limit cycle.
+
+    `--resume` goes on then, as it says.
+    """
     path = believed(joint, "inertia_kgm2 = 2.1 ", "inertia_kgm2 = 1.5 ")
     done = joint.start("tune", "mine.toml", "-y").finished(1500.0)
+    for _ in range(4):
+        if done.code == 0 or not held_up(joint, done):
+            break
+        assert joint.disabled()
+        done = joint.start("tune", "mine.toml", "-y", "--resume").finished(1500.0)
     assert done.code == 0, done.err
     assert joint.disabled()
     found = load_config(path)
