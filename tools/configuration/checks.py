@@ -92,12 +92,19 @@ def problems_between_sections(config: Config) -> list[str]:
     ]
 
 
+def range_problems(low_rad: float, high_rad: float) -> list[str]:
+    """What is wrong with the ends of the range of motion."""
+    if low_rad < high_rad:
+        return []
+    return [f"limits.position_min_rad (={low_rad:g}) must be less than limits.position_max_rad (={high_rad:g})"]
+
+
 def _limit_problems(config: Config) -> list[str]:
     limits, loop = config.limits, config.loop
     low, high = limits.position_min_rad, limits.position_max_rad
     found = []
-    if not low < high:
-        return [f"limits.position_min_rad (={low:g}) must be less than limits.position_max_rad (={high:g})"]
+    if out_of_order := range_problems(low, high):
+        return out_of_order
     if limits.following_error_max_rad >= high - low:
         error = limits.following_error_max_rad
         found.append(

@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 
 from jointctl.drivers.canopen.eds import EdsFile, read_eds
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.checks import range_problems
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import section_class
 from jointctl.tools.configuration.load import echo, understood, unit_of, unit_text
@@ -142,15 +143,17 @@ def checked(place: Place, text: str) -> tuple[Any, str]:
     return value, echo(key, text, number) if number is not None else ""
 
 
-def in_order(place: Place, value: Any, before: Mapping[Place, object]) -> None:
+_LOW, _HIGH = ("limits", "position_min_rad"), ("limits", "position_max_rad")
+
+
+def in_order(place: Place, value: object, before: Mapping[Place, object]) -> None:
     """`ValueError` in words where the limits that are known by now leave no range."""
+    if place not in (_LOW, _HIGH):
+        return
     known = {**before, place: value}
-    low, high = known.get(("limits", "position_min_rad")), known.get(("limits", "position_max_rad"))
-    if place[1] in ("position_min_rad", "position_max_rad") and isinstance(low, float) and isinstance(high, float):
-        if not low < high:
-            raise ValueError(
-                f"limits.position_min_rad (={low:g}) must be less than limits.position_max_rad (={high:g})"
-            )
+    low, high = known.get(_LOW), known.get(_HIGH)
+    if isinstance(low, float) and isinstance(high, float) and (problems := range_problems(low, high)):
+        raise ValueError(problems[0])
 
 
 # --- What the drive says of itself ---

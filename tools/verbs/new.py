@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -36,7 +35,6 @@ class DriveOptions:
 
 
 NOBODY = DriveOptions()
-NOTHING: Mapping[Place, object] = MappingProxyType({})
 
 
 def new(
@@ -156,9 +154,9 @@ def _answers(joint: UrdfJoint, node: int, output: Output, *, ask: bool) -> Joint
     if ask:
         output.note(f"--- {joint.name}")
         node_mark = Mark("drive", "node", "CANopen node of its drive", optional=False)
-        values |= dict(_asked(node_mark, (node, "in their order"), output))
+        values |= dict(_asked(node_mark, (node, "in their order"), output, values))
         what = Mark("reducer", "motor_inertia_kgm2", "motor and reducer, seen at the joint", optional=False)
-        for _, value in _asked(what, (inertia_kgm2, "a guess"), output):
+        for _, value in _asked(what, (inertia_kgm2, "a guess"), output, values):
             inertia_kgm2 = float(str(value))
     return JointAnswers(inertia_kgm2, values)
 
@@ -203,7 +201,7 @@ def _bus(subject: Subject) -> dict[Place, tuple[object, str]]:
 
 
 def _asked(
-    mark: Mark, suggested: tuple[object, str] | None, output: Output, before: Mapping[Place, object] = NOTHING
+    mark: Mark, suggested: tuple[object, str] | None, output: Output, before: Mapping[Place, object]
 ) -> Iterator[tuple[Place, object]]:
     """One question, until its answer may be beside those `before`; nothing if it is left open."""
     from jointctl.tools.inspection.first_values import checked, default_of, in_order, toml_text
