@@ -10,12 +10,10 @@ true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itse
 until 60 s, when what adapts has found its weights.  `--motions`: what
 was tuned also makes the runs of `flexible_study.py`, with learning and with adaptation, motions that never repeat.
 
-Hysteresis leaves a reducer no single stiffness.  The one that is compared is local, at the excitation's amplitude and
-at the resonance: the multisine under the weak law twists the two true masses, the twist goes through the bristle of the
-virtual joint (`hil/plant.py`), and the lines of its torque within a third of an octave of the resonance are regressed
-on those of twist and twist rate.  Stiffness and damping with which the twist is computed are those that come out; the
-resonance is that of the stiffness.  Not over all lines: the large slow twist slides, and the small quick one that rides
-on it is stiffer by up to a tenth, which is what moves the resonance.
+Hysteresis leaves a reducer no single stiffness.  The one that is compared is what the virtual reducer did in the
+response itself: its torque over its twist, both of the simulation and by the lines of the excitation, as the analysis
+takes positions (`frequency_response.py`), within a third of an octave of the resonance that comes out.  The loss there
+counts as damping.
 """
 
 from __future__ import annotations
@@ -28,9 +26,12 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -40,20 +41,24 @@ sys.path.insert(0, str(ROOT))
 
 from jointctl.drivers.errors import JointctlError  # noqa: E402
 from jointctl.firmware_py.states import Encoders  # noqa: E402
-from jointctl.tools.analysis.linear_loop import TwoMasses, linear_loop, loop_settings, sampled_joint  # noqa: E402
+from jointctl.hil.lockstep import TRUE_POSITION_rad  # noqa: E402
+from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
-from jointctl.tools.configuration.sections import Friction  # noqa: E402
+from jointctl.tools.configuration.sections import Friction, Virtual  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.controllers import Controller  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
-from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
-from jointctl.tools.session.plan import TerminalConsent  # noqa: E402
-from jointctl.tools.tuning.carry_out import Carried, Carrier  # noqa: E402
-from jointctl.tools.tuning.excitation import config_of_response, multisine, speed_and_period  # noqa: E402
+from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402
+from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
+from jointctl.tools.tuning import carry_out  # noqa: E402
+from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
+from jointctl.tools.tuning.excitation import ResponseMotion, ResponsePlan  # noqa: E402
 from jointctl.tools.tuning.found_values import SMALL_MOTION, values_of_fit, with_values  # noqa: E402
+from jointctl.tools.tuning.frequency_response import fourier_sums, median_of  # noqa: E402
 from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit  # noqa: E402
 from jointctl.tools.tuning.tune_options import TuneOptions  # noqa: E402
@@ -62,18 +67,44 @@ from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
 
 RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
+IN_LOCKSTEP = sweeping.sweep_in_lockstep
 HELD_LINK = ((0.0, 1e4), (0.0, 200.0))  # of a rigid joint: a link that nothing moves
 
 
 class Timed(Carrier):
-    """Counts the time that the joint moves."""
+    """Counts the time that the joint moves and that its simulation takes, and keeps the whole response."""
 
-    seconds = 0.0
+    seconds = simulation_s = 0.0
+    response: tuple[ResponsePlan, LockstepRun] | None = None
 
-    def run(self, *args: Any, **how: Any) -> Carried:
-        carried = super().run(*args, **how)
-        self.seconds += len(carried.records) / args[0].loop.rate_Hz
+    def run(self, config: Config, motion: Motion, *args: Any, **how: Any) -> Carried:
+        runs: list[LockstepRun] = []
+
+        class Watched(LockstepJoint):
+            def run_as_configured(self, *given: Any, **options: Any) -> LockstepRun:
+                runs.append(super().run_as_configured(*given, **options))
+                return runs[-1]
+
+        with patch.object(carry_out, "LockstepJoint", Watched), self.simulation():
+            carried = super().run(config, motion, *args, **how)
+        self.seconds += len(carried.records) / config.loop.rate_Hz
+        if isinstance(motion, ResponseMotion) and len(motion.plan.legs.starts) > 2 * STAGE_PAIRS:
+            self.response = motion.plan, runs[-1]
         return carried
+
+    @contextmanager
+    def simulation(self) -> Iterator[None]:
+        """Its processor time is not that of the tune."""
+        begun = time.process_time()
+        try:
+            yield
+        finally:
+            self.simulation_s += time.process_time() - begun
+
+    def sweep(self, *given: Any, **options: Any) -> Any:
+        """Of the friction step, which does not ask a carrier."""
+        with self.simulation():
+            return IN_LOCKSTEP(*given, **options)
 
 
 def scaled(friction: Friction, positive: float, negative: float) -> Friction:
@@ -138,50 +169,66 @@ def true_margin_deg(config: Config, true_kgm2: float) -> float:
 
 
 NEAR_octaves = 1.0 / 3.0
-SETTLED = 12  # times that stiffness and twist follow each other
+SETTLED = 12  # times that stiffness and resonance follow each other
 
 
-def local_reducer(config: Config, true_kgm2: float, job: Tune) -> tuple[float, float, float]:
-    """(stiffness [Nm/rad], resonance [Hz], damping [Nm s/rad]) at the amplitude of the excitation; see the module."""
+def torsion_Nm(virtual: Virtual, twist_rad: np.ndarray) -> np.ndarray:
+    """Of the virtual reducer without damping, `hil/plant.py`: three slopes and the bristle, which begins relaxed."""
+    size, slope, knee_rad, knee_Nm = np.abs(twist_rad), virtual.reducer_stiffness_Nmprad, 0.0, 0.0
+    spring = slope * size
+    for to_Nm, beyond in zip(virtual.reducer_knees_Nm, virtual.reducer_stiffness_beyond_Nmprad, strict=True):
+        knee_rad, knee_Nm = knee_rad + (to_Nm - knee_Nm) / slope, to_Nm
+        spring += (beyond - slope) * np.maximum(size - knee_rad, 0.0)
+        slope = beyond
+    slide_rad, z, at_rad, bristle = 0.5 * virtual.hysteresis_width_rad, 0.0, 0.0, np.zeros(len(twist_rad))
+    for i, to_rad in enumerate(twist_rad if slide_rad > 0.0 else ()):
+        way, half = to_rad - at_rad, 0.5 * abs(to_rad - at_rad)
+        z = (z * (slide_rad - half) + slide_rad * way) / (slide_rad + half)
+        at_rad, bristle[i] = to_rad, z
+    torque: np.ndarray = np.copysign(spring, twist_rad) + virtual.reducer_stiffness_Nmprad * bristle
+    return torque
+
+
+def true_twist_rad(config: Config, run: LockstepRun) -> np.ndarray:
+    """Of the trajectory's records: the motor by its encoder without what that reads too much, the link as it was."""
+    virtual, ratio = config.virtual, config.joint.reduction_ratio
+    assert virtual is not None
+    read_rad = np.asarray(run.log.position_rad)[run.tracking]
+    eccentric = np.sin(ratio * read_rad + virtual.motor_encoder_eccentricity_phase_rad)
+    motor_rad = read_rad - virtual.motor_encoder_eccentricity_rad / ratio * eccentric
+    waves = zip(
+        virtual.kinematic_error_rad, virtual.kinematic_error_per_motor_turn, virtual.kinematic_error_phase_rad,
+        strict=True,
+    )  # fmt: skip
+    ahead = sum((size * np.sin(order * ratio * motor_rad + phase) for size, order, phase in waves), 0.0 * motor_rad)
+    twist: np.ndarray = motor_rad + ahead - run.truth[run.tracking, TRUE_POSITION_rad]
+    return twist
+
+
+def local_reducer(config: Config, true_kgm2: float, carrier: Timed) -> tuple[float, float, float]:
+    """(stiffness [Nm/rad], resonance [Hz], damping [Nm s/rad]) of the response that was measured; see the module."""
     virtual = config.virtual
     assert virtual is not None
-    assert job.response is not None
-    assert job.fit is not None
-    measuring = config_of_response(job.config.model_copy(update={"control": job.original.control}), None)
-    settings, _ = loop_settings(measuring)
-    sine = multisine(config.loop.rate_Hz, speed_and_period(measuring)[1])
+    assert carrier.response is not None
+    plan, run = carrier.response
+    twist = true_twist_rad(config, run)
+    torque = torsion_Nm(virtual, twist)
+    cycle = np.round(np.asarray(run.log.trajectory_s)[run.tracking] * config.loop.rate_Hz).astype(int)
+    rows = np.searchsorted(cycle, plan.legs.starts)[:, None] + np.arange(plan.samples)
+    line = np.fft.rfft(plan.sine.wave)[plan.sine.bins]
+    turned = line * np.exp(1j * math.tau * plan.sine.bins * (cycle[rows[:, :1]] / plan.samples))
+    sums = (fourier_sums(values[rows], plan.sine.bins) / turned for values in (torque, twist))
+    of_torque, of_twist = map(median_of, sums)
+    spring, frequency_Hz = of_torque / of_twist, plan.sine.frequency_Hz
     motor, link = virtual.motor_side_inertia_kgm2, true_kgm2 - virtual.motor_side_inertia_kgm2
-    first, slide_rad = virtual.reducer_stiffness_Nmprad, 0.5 * virtual.hysteresis_width_rad
-    torque, z = np.fft.rfft(sine.wave), np.exp(2j * math.pi * sine.frequency_Hz * settings.period_s)
-    law = linear_loop(settings).controller.response(z)[:, 0, 0]
-    viscous, share = job.fit.friction_Nmspr.value, virtual.link_friction_share
-    stiffness, damping = SMALL_MOTION * first, virtual.reducer_damping_Nmspr
+    joint = TwoMasses(motor, link, virtual.reducer_stiffness_Nmprad, 0.0)
+    loss = 0.0
     for _ in range(SETTLED):
-        joint = TwoMasses(motor, link, stiffness, damping, (0.0, 0.0), (viscous * (1.0 - share), viscous * share))
-        late = (virtual.command_delay_s, virtual.current_lag_s)
-        both = sampled_joint(settings.period_s, *late, joint, Encoders.BOTH).response(z)
-        spectrum = np.zeros(len(torque), dtype=np.complex128)
-        sensitivity = 1.0 / (1.0 - law * both[:, 1, 0])
-        spectrum[sine.bins] = torque[sine.bins] * sensitivity * (both[:, 1, 0] - both[:, 0, 0])
-        twist = job.response.peak_Nm * np.fft.irfft(spectrum, len(sine.wave))
-        if slide_rad == 0.0:
-            stiffness = first
-            break
-        bristle_rad, at_rad, deflection = 0.0, 0.0, np.empty(2 * len(twist))
-        for i, to_rad in enumerate(np.tile(twist, 2)):  # the second period has forgotten the start
-            way, half = to_rad - at_rad, 0.5 * abs(to_rad - at_rad)
-            bristle_rad = (bristle_rad * (slide_rad - half) + slide_rad * way) / (slide_rad + half)
-            at_rad, deflection[i] = to_rad, bristle_rad
-        near = sine.bins[np.abs(np.log2(sine.frequency_Hz / joint.resonance_Hz)) < NEAR_octaves]
-        slid = np.fft.rfft(deflection[len(twist) :])[near] / job.response.peak_Nm
-        moved = spectrum[near] * np.vstack(
-            (np.ones(len(near)), 1j * math.tau * near * config.loop.rate_Hz / len(twist))
-        )
-        columns = np.hstack((moved.real, moved.imag)).T
-        more, loss = np.linalg.lstsq(columns, np.concatenate((slid.real, slid.imag)), rcond=None)[0]
-        stiffness = first * (1.0 + more)
-        damping = virtual.reducer_damping_Nmspr + first * loss
-    return stiffness, replace(joint, stiffness_Nmprad=stiffness).resonance_Hz, damping
+        near = np.abs(np.log2(frequency_Hz / joint.resonance_Hz)) < NEAR_octaves
+        joint = replace(joint, stiffness_Nmprad=float(np.median(spring[near].real)))
+        loss = float(np.median(spring[near].imag))
+    damping = virtual.reducer_damping_Nmspr + loss / (math.tau * joint.resonance_Hz)
+    return joint.stiffness_Nmprad, joint.resonance_Hz, damping
 
 
 def rmse_mrad(config: Config) -> tuple[float, float]:
@@ -211,10 +258,13 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     try:
         with tempfile.TemporaryDirectory() as folder:
             job = Tune(guess, TuneOptions(lockstep=True), carrier, Path(folder))
-            job.carry_out("")
+            with patch.object(sweeping, "sweep_in_lockstep", carrier.sweep):
+                job.carry_out("")
     except JointctlError as error:
         return {**row, "failed": error.message}
-    row |= {"cpu_s": time.process_time() - started, "joint_s": carrier.seconds + job.state["friction"]["seconds"]}
+    whole_s = time.process_time() - started
+    row |= {"cpu_s": whole_s, "computing_s": whole_s - carrier.simulation_s}
+    row |= {"joint_s": carrier.seconds + job.state["friction"]["seconds"]}
     fit, virtual = job.fit, plant.virtual
     assert fit is not None
     row["flexible"] = fit.flexible
@@ -222,7 +272,7 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
     row["late_ms_half"] = 1e3 * fit.late_s.half
     row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
-    local = local_reducer(plant, true_kgm2, job) if soft else (0.0, 0.0, 0.0)
+    local = local_reducer(plant, true_kgm2, carrier) if soft else (0.0, 0.0, 0.0)
     if soft:
         link = true_kgm2 - virtual.motor_side_inertia_kgm2
         row["link"] = fit.link_kgm2.value / link - 1.0
@@ -292,7 +342,7 @@ def main() -> None:
     print(f"{len(good)} of {len(rows)} tuned, seed {given.seed}, {'soft' if given.soft else 'rigid'}; simulated")
     for name in ("inertia", "link", "resonance", "stiffness", "stiffness_over_first", "late_ms", "rmse_mrad",
                  "rmse_true_mrad", "ratio", "late_rmse_mrad", "late_rmse_true_mrad", "late_ratio", "joint_s",
-                 "cpu_s"):  # fmt: skip
+                 "computing_s", "cpu_s"):  # fmt: skip
         print(f"  {name}: {_figures(good, name)}")
     margins_deg = sorted(row["true_margin_deg"] for row in good)
     print(f"  true phase margin: worst {margins_deg[0]:.1f}, 30 deg and more {sum(m >= 30.0 for m in margins_deg)}")

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -416,6 +416,14 @@ CONTROLLERS: dict[ControllerKind, Callable[[LoopSettings], StateSpace]] = {
 # --- the loop ---
 
 
+def poles_of(plant: StateSpace, law: StateSpace) -> ComplexArray:
+    """Eigenvalues z of the closed loop, (..., states); `plant` may be many, its arrays stacked along the first axis."""
+    upper = np.concatenate((plant.a + plant.b @ law.d @ plant.c, plant.b @ law.c), axis=-1)
+    own = np.broadcast_to(law.a, (*plant.a.shape[:-2], *law.a.shape))
+    lower = np.concatenate((law.b @ plant.c, own), axis=-1)
+    return np.asarray(np.linalg.eigvals(np.concatenate((upper, lower), axis=-2)), dtype=np.complex128)
+
+
 @dataclass(frozen=True)
 class LinearLoop:
     """Plant and controller of one setting."""
@@ -432,10 +440,8 @@ class LinearLoop:
 
     def closed_loop_poles(self, gain: float = 1.0) -> ComplexArray:
         """Eigenvalues z of the closed loop with L times `gain`; stable where all |z| < 1."""
-        plant, law = self.joint.state_space(), self.controller
-        b = gain * plant.b
-        matrix = np.block([[plant.a + b @ law.d @ plant.c, b @ law.c], [law.b @ plant.c, law.a]])
-        return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
+        plant = self.joint.state_space()
+        return poles_of(replace(plant, b=gain * plant.b), self.controller)
 
     def is_stable(self, gain: float = 1.0) -> bool:
         return bool(np.max(np.abs(self.closed_loop_poles(gain))) < 1.0)

@@ -109,22 +109,23 @@ def from_dict(found: dict[str, Any]) -> FrequencyResponse:
     )  # fmt: skip
 
 
-def _sums(rows: np.ndarray, bins: np.ndarray) -> ComplexArray:
+def fourier_sums(rows: np.ndarray, bins: np.ndarray) -> ComplexArray:
     """Fourier sums (legs, lines) of rows (legs, N), without their trend and windowed."""
     window = signal.get_window("hann", rows.shape[1])
     spectrum: ComplexArray = np.fft.rfft(signal.detrend(rows, axis=1) * window, axis=1)[:, bins]
     return spectrum
 
 
-def _median(values: ComplexArray) -> ComplexArray:
+def median_of(values: ComplexArray) -> ComplexArray:
+    """Over the legs, of real and imaginary part."""
     found: ComplexArray = np.median(values.real, axis=0) + 1j * np.median(values.imag, axis=0)
     return found
 
 
 def _channel(y: ComplexArray, u: ComplexArray, r: ComplexArray) -> Channel:
     legs = len(y)
-    of_torque = _median(u / r)
-    response = _median(y / r) / of_torque
+    of_torque = median_of(u / r)
+    response = median_of(y / r) / of_torque
     left = (y - response * u) / r / of_torque
     spread = TO_SIGMA * np.median(np.abs(left), axis=0) / math.sqrt(math.log(4.0))  # of a complex normal value
     width = float(stats.t.ppf(0.5 + 0.5 * LEVEL, max(legs - 1, 1))) * MEDIAN_LOSS / math.sqrt(legs)
@@ -164,7 +165,7 @@ def response_of(config: Config, plan: ResponsePlan, records: np.recarray) -> Fre
         columns["r"].append(excitation[at % count])
     if len(columns["u"]) < LEAST_LEGS:
         raise DataError(f"legs that were measured (={len(columns['u'])}) must be at least {LEAST_LEGS}", "run it again")
-    sums = {name: _sums(np.array(values), plan.sine.bins) for name, values in columns.items()}
+    sums = {name: fourier_sums(np.array(values), plan.sine.bins) for name, values in columns.items()}
     law, other = sides_of(config)
     channels = {law: _channel(sums["y"], sums["u"], sums["r"])}
     if other is not None:

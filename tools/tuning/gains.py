@@ -25,6 +25,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from jointctl.drivers.errors import ConfigurationError
@@ -33,11 +34,12 @@ from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_OBSERVER_ra
 from jointctl.tools.analysis.linear_loop import (
     Array,
     ComplexArray,
-    LinearLoop,
     LoopSettings,
+    StateSpace,
     TwoMasses,
     linear_loop,
     loop_settings,
+    poles_of,
     sampled_joint,
     two_masses,
 )
@@ -255,17 +257,24 @@ class _Search:
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
         late_s = settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
-        self._joints = [
+        joints = [
             sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders)
             for joint in identified_joints(config, fit)
         ]
-        self._of_goals = len(self._joints)
-        self._joints += [linear_loop(case).joint for case in cases(settings)]
-        self._joints += [
+        self._of_goals = len(joints)
+        joints += [linear_loop(case).joint for case in cases(settings)]
+        joints += [
             sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders)
             for joint in steady_joints(config)
         ]
-        self._responses = [joint.response(self._z) for joint in self._joints]
+        self._responses = np.array([joint.response(self._z) for joint in joints])
+        plants = [joint.state_space() for joint in joints]
+        sizes = [len(plant.a) for plant in plants]  # by their delay
+        self._alike = [np.flatnonzero(np.equal(sizes, size)) for size in sorted(set(sizes))]
+        self._plants = [
+            StateSpace(*(np.array([getattr(plants[i], name) for i in alike]) for name in "abcd"))
+            for alike in self._alike
+        ]
         counts = [law_resolution_rad(config), abs(joint_rad_per_count(config))]
         two = self.nominal.encoders == Encoders.BOTH
         self._count_rad = np.array(counts if two else counts[:1])
@@ -278,26 +287,26 @@ class _Search:
 
     def _judge(self, settings: LoopSettings) -> Judged:
         controller = linear_loop(settings).controller
+        radii = np.empty(len(self._responses))
+        for alike, plants in zip(self._alike, self._plants, strict=True):
+            radii[alike] = np.max(np.abs(poles_of(plants, controller)), axis=-1)
+        if np.max(radii) >= 1.0:
+            worst = float(np.max(radii))
+            return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
         law = controller.response(self._z)
-        margins: list[tuple[float, float, float]] = []
-        settling = 0.0
-        for number, (joint, response) in enumerate(zip(self._joints, self._responses, strict=True)):
-            radius = float(np.max(np.abs(LinearLoop(settings, joint, controller).closed_loop_poles())))
-            if radius >= 1.0:
-                return Judged(settings, UNSTABLE * radius, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
-            settling = -settings.period_s / math.log(radius) if number == 0 else settling
-            margins.append(_margins(-(law @ response)[:, 0, 0]))
+        phases, gains, peaks = _margins(-(law @ self._responses)[:, :, 0, 0])
+        own = slice(self._of_goals)
+        gate = slice(self._of_goals, None)
         response = self._responses[0]
         sensitivity = 1.0 / (1.0 - (law @ response)[:, 0, 0])
         error = response[:, 0, 0] * sensitivity * np.hypot(1.0 / self._omega, 1.0 / RIPPLE_radps)
         noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
-        phases, gains, peaks = zip(*margins[: self._of_goals], strict=True)
-        gate = margins[self._of_goals :]
         return Judged(
-            settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)), min(phases), min(gains), max(peaks),
+            settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
+            float(np.min(phases[own])), float(np.min(gains[own])), float(np.max(peaks[own])),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
-            min((phase for phase, _, _ in gate), default=90.0), max((peak for _, _, peak in gate), default=1.0),
-            settling,
+            float(np.min(phases[gate], initial=90.0)), float(np.max(peaks[gate], initial=1.0)),
+            -settings.period_s / math.log(radii[0]),
         )  # fmt: skip
 
 
@@ -311,20 +320,23 @@ def _frequencies_radps(config: Config, period_s: float) -> Array:
     return np.unique(np.concatenate((omega, near[near < highest])))
 
 
-def _margins(open_loop: ComplexArray) -> tuple[float, float, float]:
-    """(phase margin [deg], gain margin in either direction, largest |S|) on the grid of frequencies."""
-    logarithm = np.log(np.abs(open_loop))
-    i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
-    share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
-    crossing = (1.0 - share) * open_loop[i] + share * open_loop[i + 1]
-    phase = float(np.degrees(np.min(np.abs(np.angle(-crossing)), initial=math.pi)))
-    imaginary, real = open_loop.imag, open_loop.real
-    i = np.flatnonzero((imaginary[:-1] > 0.0) != (imaginary[1:] > 0.0))
-    share = imaginary[i] / (imaginary[i] - imaginary[i + 1])
-    where = (1.0 - share) * real[i] + share * real[i + 1]
-    size = np.abs(where[where < 0.0])
-    gain = float(np.min(np.maximum(size, 1.0 / size), initial=math.inf))
-    return phase, gain, float(np.max(1.0 / np.abs(1.0 + open_loop)))
+def _margins(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
+    """(phase margin [deg], gain margin in either direction, largest |S|) of each row on the grid of frequencies."""
+
+    def crossed(values: Array) -> tuple[ComplexArray, NDArray[np.bool_]]:
+        """L between two frequencies where `values` goes through zero, and where it does."""
+        before, after = values[:, :-1], values[:, 1:]
+        crosses = (before > 0.0) != (after > 0.0)
+        share = before / np.where(crosses, before - after, 1.0)
+        return (1.0 - share) * open_loop[:, :-1] + share * open_loop[:, 1:], crosses
+
+    at_one, crosses = crossed(np.log(np.abs(open_loop)))
+    phase = np.degrees(np.min(np.abs(np.angle(-at_one)), axis=1, where=crosses, initial=math.pi))
+    real, crosses = crossed(open_loop.imag)
+    size = np.abs(real.real)
+    crosses &= real.real < 0.0
+    gain = np.min(np.maximum(size, 1.0 / np.where(crosses, size, 1.0)), axis=1, where=crosses, initial=math.inf)
+    return phase, gain, np.max(1.0 / np.abs(1.0 + open_loop), axis=1)
 
 
 def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective: str = "tracking") -> ChosenGains:

@@ -1,15 +1,16 @@
 """Rigid or two-mass model of a joint, fitted to its frequency response with delay and lag of the current loop.
 
-Both are `linear_loop`'s sampled joint, exact for every delay; a rigid one is the motor's mass alone.  Least squares of
-the relative error of every line, weighted by its interval, with a soft loss, from several starts.  The model with two
-masses is taken where the data tell it from the rigid one (Bayes' information criterion).  Intervals are those of the
-linearised fit, as wide as its residuals say, and of inertias and delay what friction adds.
+Both are `linear_loop`'s sampled joint, and its reducer also loses what hysteresis takes, the same share at every
+frequency; a rigid joint is the motor's mass alone.  Least squares of the relative error of every line, weighted by its
+interval, with a soft loss, from several starts.  The model with two masses is taken where the data tell it from the
+rigid one (Bayes' information criterion).  Intervals are those of the linearised fit, as wide as its residuals say, and
+of inertias and delay what friction adds.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 
 from jointctl.drivers.errors import DataError
-from jointctl.firmware_py.states import Encoders
-from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
+from jointctl.tools.analysis.linear_loop import TwoMasses
 from jointctl.tools.tuning.excitation import ResponsePlan
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
@@ -34,6 +34,7 @@ LEAST_RELATIVE = 0.02  # of a line: what no model describes
 LEAST_LINES = 12
 SOFT = 1.5  # residuals beyond so many deviations count less
 DAMPING_SHARE = 0.04  # of the critical damping, where a fit begins
+LOSS = 0.05  # of a spring, where a fit begins
 START_RATIOS = (0.4, 1.2, 3.5)  # link over motor
 START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0)
 STARTS = 3  # of them, the best ones, are followed
@@ -47,7 +48,8 @@ MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0
 MODEL_LATE_s = 1e-4
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
-           "delay_s", "lag_s", "late_s")  # fmt: skip
+           "delay_s", "lag_s", "late_s", "loss_factor")  # fmt: skip
+_ALIASES = np.arange(-2, 3)  # of the rate, whose answers a sample holds: those beyond are less than 1e-3
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class JointFit:
-    """What was found; `link_kgm2`, `resonance_Hz`, `stiffness_Nmprad`, `damping_Nmspr` are 0 of a rigid joint."""
+    """What was found; all of the reducer is 0 of a rigid joint.
+
+    `damping_Nmspr` is what the reducer loses at its resonance, to `loss_factor` as well.
+    """
 
     flexible: bool
     values: dict[str, Estimate]
@@ -88,9 +93,12 @@ class JointFit:
 
     def response(self, frequency_Hz: np.ndarray, side: str) -> ComplexArray:
         """Of the model, at the motor or the link."""
-        return _response(self.joint(), self.delay_s.value, self.lag_s.value, self.period_s, frequency_Hz)[
-            side if self.flexible else "motor"
-        ]
+        joint, loss = self.joint(), self.loss_factor.value
+        if self.flexible:
+            lost = loss * joint.stiffness_Nmprad / (math.tau * joint.resonance_Hz)
+            joint = replace(joint, damping_Nmspr=joint.damping_Nmspr - lost)
+        late = (self.delay_s.value, self.lag_s.value)
+        return _response(joint, loss, *late, self.period_s, frequency_Hz)[side if self.flexible else "motor"]
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -103,17 +111,27 @@ class JointFit:
 def fit_from_dict(found: dict[str, Any]) -> JointFit:
     """What `to_dict` made."""
     values = {name: Estimate(one["value"], one["half"]) for name, one in found["values"].items()}
+    values.setdefault("loss_factor", Estimate(0.0, 0.0))  # of a tune that was begun before there was one
     return JointFit(
         found["model"] == "two masses", values, found["period_s"], found["rms"], found["lines"], found["criterion"]
     )
 
 
 def _response(
-    joint: TwoMasses, delay_s: float, lag_s: float, period_s: float, frequency_Hz: np.ndarray
+    joint: TwoMasses, loss: float, delay_s: float, lag_s: float, period_s: float, frequency_Hz: np.ndarray
 ) -> dict[str, ComplexArray]:
-    z = np.exp(1j * math.tau * frequency_Hz * period_s)
-    both = sampled_joint(period_s, delay_s, lag_s, joint, Encoders.BOTH).response(z)
-    return {"link": both[:, 0, 0], "motor": both[:, 1, 0]}
+    """Of the sampled joint, as `sampled_joint` has it, whose spring K (1 + j loss) also loses what hysteresis takes.
+
+    In continuous time behind a hold, summed over the frequencies that a sample cannot tell apart.
+    """
+    omega = math.tau * (frequency_Hz + _ALIASES[:, None] / period_s)
+    s = 1j * omega
+    spring = joint.stiffness_Nmprad * (1.0 + 1j * loss * np.sign(omega)) + joint.damping_Nmspr * s
+    motor = (joint.motor_kgm2 * s + joint.bristle_damping_Nmspr[0]) * s + spring
+    link = (joint.link_kgm2 * s + joint.bristle_damping_Nmspr[1]) * s + spring
+    torque = np.exp(-delay_s * s) * (1.0 - np.exp(-period_s * s)) / ((1.0 + lag_s * s) * period_s * s)
+    of_both = torque / (motor * link - spring * spring)
+    return {"link": np.sum(of_both * spring, axis=0), "motor": np.sum(of_both * link, axis=0)}
 
 
 @dataclass(frozen=True)
@@ -144,7 +162,10 @@ def _used(found: FrequencyResponse) -> list[_Data]:
 
 
 class _Model:
-    """Parameters are logarithms but for the friction: (J, delay, lag, B) and (link / motor, resonance, damping)."""
+    """Parameters, logarithms but for B and loss: (J, delay, lag, B), and (link / motor, resonance, damping, loss).
+
+    The loss, which is the same at every frequency, is that of hysteresis: as damping alone it would look like delay.
+    """
 
     def __init__(self, parts: list[_Data], period_s: float, flexible: bool) -> None:
         self.parts, self.period_s, self.flexible = parts, period_s, flexible
@@ -161,29 +182,28 @@ class _Model:
         damping = 2.0 * math.exp(x[6]) * omega * reduced
         return TwoMasses(motor, link, omega * omega * reduced, damping, (0.0, 0.0), (viscous, 0.0))
 
+    def loss(self, x: np.ndarray) -> float:
+        return float(x[7]) if self.flexible else 0.0
+
     def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
-        """Without bound for a trial that grows beyond all numbers in one period: the search turns back there."""
         joint, late = self.joint(x), (math.exp(x[1]), math.exp(x[2]))
         rows = [np.array([(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD])]
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            for part in self.parts:
-                side = part.side if self.flexible else "motor"
-                try:
-                    model = _response(joint, *late, self.period_s, part.frequency_Hz)[side]
-                except np.linalg.LinAlgError:
-                    return np.full(self.count + 1, np.inf)
-                off = np.log(model / part.measured) / part.sigma
-                rows += [off.real, off.imag]
+        for part in self.parts:
+            side = part.side if self.flexible else "motor"
+            model = _response(joint, self.loss(x), *late, self.period_s, part.frequency_Hz)[side]
+            off = np.log(model / part.measured) / part.sigma
+            rows += [off.real, off.imag]
         return np.concatenate(rows)
 
     def fitted(self, start: list[float]) -> OptimizeResult:
         low = [-12.0, math.log(1e-5), math.log(1e-5), -1e3]
         high = [12.0, math.log(LATEST_s), math.log(LATEST_s), 1e4]
         if self.flexible:
-            low, high = [*low, math.log(0.02), math.log(2.0), math.log(1e-3)], [*high, math.log(50.0), 8.0, 0.0]
+            low = [*low, math.log(0.02), math.log(2.0), math.log(1e-3), 0.0]
+            high = [*high, math.log(50.0), 8.0, 0.0, 1.0]
         return least_squares(
             self.residuals, start, bounds=(low, high), loss="soft_l1", f_scale=SOFT,
-            x_scale=[1.0, 1.0, 1.0, 10.0] + [1.0] * (3 if self.flexible else 0), max_nfev=60, ftol=SLACK, xtol=SLACK,
+            x_scale=[1.0, 1.0, 1.0, 10.0] + [1.0, 1.0, 1.0, 0.1] * self.flexible, max_nfev=60, ftol=SLACK, xtol=SLACK,
         )  # fmt: skip
 
     def criterion(self, found: OptimizeResult) -> float:
@@ -195,10 +215,11 @@ class _Model:
         joint, delay, lag = self.joint(x), math.exp(x[1]), math.exp(x[2])
         if self.flexible:
             whole = joint.motor_kgm2 + joint.link_kgm2
-            parts = [whole, joint.link_kgm2, joint.resonance_Hz, joint.stiffness_Nmprad, joint.damping_Nmspr]
+            damping = joint.damping_Nmspr + self.loss(x) * joint.stiffness_Nmprad / (math.tau * joint.resonance_Hz)
+            parts = [whole, joint.link_kgm2, joint.resonance_Hz, joint.stiffness_Nmprad, damping]
         else:
             parts = [joint.motor_kgm2, 0.0, 0.0, 0.0, 0.0]
-        return np.array([*parts, x[3], delay, lag, delay + lag])
+        return np.array([*parts, x[3], delay, lag, delay + lag, self.loss(x)])
 
 
 def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
@@ -210,7 +231,7 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
     soft = _Model(parts, found.period_s, True)
     inertia = float(np.clip(one.x[0], -3.0 + begin[0], 3.0 + begin[0]))
     starts = [
-        [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE)]
+        [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE), LOSS]
         for ratio in START_RATIOS
         for resonance in START_RESONANCES_Hz
     ]
@@ -235,9 +256,10 @@ def fitted_again(found: FrequencyResponse, before: JointFit) -> Estimate:
     late = [math.log(max(before.values[name].value, 2e-5)) for name in ("delay_s", "lag_s")]
     start = [math.log(before.inertia_kgm2.value), *late, before.friction_Nmspr.value]
     if before.flexible:
-        damping = joint.damping_Nmspr * math.tau * joint.resonance_Hz / (2.0 * joint.stiffness_Nmprad)
+        loss = min(before.loss_factor.value, 0.99)
+        damping = 0.5 * (joint.damping_Nmspr * math.tau * joint.resonance_Hz / joint.stiffness_Nmprad - loss)
         start += [math.log(joint.link_kgm2 / joint.motor_kgm2), math.log(joint.resonance_Hz)]
-        start.append(math.log(min(max(damping, 2e-3), 0.9)))
+        start += [math.log(min(max(damping, 2e-3), 0.9)), loss]
     return _intervals(model, model.fitted(start))["inertia_kgm2"]
 
 

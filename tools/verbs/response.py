@@ -23,12 +23,14 @@ ROWS = (
     ("link_kgm2", "link inertia [kg m^2]", 1.0, ""),
     ("resonance_Hz", "resonance [Hz]", 1.0, "of a small motion"),
     ("stiffness_Nmprad", "stiffness [Nm/rad]", 1.0, "of a small motion"),
-    ("damping_Nmspr", "damping of the reducer [Nm s/rad]", 1.0, ""),
+    ("damping_Nmspr", "damping of the reducer [Nm s/rad]", 1.0, "at the resonance"),
+    ("loss_factor", "loss factor of the reducer", 1.0, "hysteresis, at every frequency"),
     ("friction_Nmspr", "slope of the friction [Nm s/rad]", 1.0, "at the speed of the triangle"),
     ("late_s", "delay and lag together [ms]", 1e3, "from a position sample to its torque"),
     ("delay_s", "of it delay [ms]", 1e3, ""),
     ("lag_s", "of it lag of the current [ms]", 1e3, ""),
 )  # fmt: skip
+OF_A_REDUCER = ("link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "loss_factor")
 
 
 def response(
@@ -107,7 +109,7 @@ def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
     }  # fmt: skip
     for name, label, scale, remark in ROWS:
         one = fit.values[name]
-        if not fit.flexible and name in ("link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr"):
+        if not fit.flexible and name in OF_A_REDUCER:
             continue
         configured = known.get(name)
         table.add_row(

@@ -35,7 +35,7 @@ from jointctl.tools.tuning.excitation import (
 )
 from jointctl.tools.tuning.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
-from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint, fitted_again, gravity_of
+from jointctl.tools.tuning.joint_fit import Estimate, fit_from_dict, fit_joint, fitted_again, gravity_of
 from jointctl.tools.tuning.tune_options import ResponseOptions
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
@@ -219,6 +219,43 @@ def test_two_masses_are_found_with_intervals_from_a_wrong_guess(seed: int) -> No
     again = fit_from_dict(fit.to_dict())
     frequency = np.array([5.0, 30.0, 100.0])
     assert again.response(frequency, "link") == pytest.approx(fit.response(frequency, "link"))
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.25])
+def test_what_hysteresis_loses_is_not_taken_for_delay(loss: float) -> None:
+    """A spring that loses the same share at every frequency, against that of the sampled joint in continuous time."""
+    found = made_response(SOFT, (1.3e-3, 0.6e-3))
+
+    def continuous(share: float) -> np.ndarray:
+        s = 2j * math.pi * found.frequency_Hz
+        spring = SOFT.stiffness_Nmprad * (1.0 + 1j * share) + SOFT.damping_Nmspr * s
+        motor, link = (
+            SOFT.motor_kgm2 * s**2 + SOFT.bristle_damping_Nmspr[0] * s + spring,
+            SOFT.link_kgm2 * s**2 + spring,
+        )
+        both: np.ndarray = np.array((link, spring)) / (motor * link - spring**2)
+        return both
+
+    channels = [
+        replace(channel, response=channel.response * factor)
+        for channel, factor in zip((found.motor, found.link), continuous(loss) / continuous(0.0), strict=True)
+        if channel is not None
+    ]
+    fit = fit_joint(replace(found, motor=channels[0], link=channels[1]), 2.0)
+    assert fit.late_s.value == pytest.approx(1.9e-3, abs=0.03e-3)
+    assert fit.loss_factor.value == pytest.approx(loss, abs=0.03)
+    at_resonance = loss * SOFT.stiffness_Nmprad / (2.0 * math.pi * SOFT.resonance_Hz)
+    assert fit.damping_Nmspr.value == pytest.approx(SOFT.damping_Nmspr + at_resonance, rel=0.15)
+
+
+def test_the_model_of_the_fit_is_the_sampled_joint() -> None:
+    fit = fit_joint(made_response(SOFT, (1.3e-3, 0.6e-3)), 2.0)
+    plain = replace(fit, values={**fit.values, "loss_factor": Estimate(0.0, 0.0)})
+    frequency = np.geomspace(1.0, 250.0, 50)
+    late = (fit.delay_s.value, fit.lag_s.value)
+    true = sampled_joint(T, *late, fit.joint(), Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
+    for side, column in (("motor", 1), ("link", 0)):
+        assert plain.response(frequency, side) == pytest.approx(true[:, column, 0], rel=1e-3, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
