@@ -18,6 +18,8 @@ from jointctl.firmware_py.records import (
     VelocityState,
 )
 
+COAST_s = 0.01  # in which a velocity that is not read comes to that of the reference
+
 
 @kernel
 def low_pass_gain(cutoff_Hz: float, interval_s: float) -> float:
@@ -46,6 +48,17 @@ def step_velocity(
         state.error_rate_radps += gain * ((error_rad - state.last_error_rad) / interval_s - state.error_rate_radps)
     state.last_position_rad = position_rad
     state.last_error_rad = error_rad
+
+
+@kernel
+def coast_velocity(constants: VelocityConstants, state: VelocityState, elapsed_cycles: int) -> None:
+    """Periods without a sample: the velocity comes to that of the reference, as the loop would have it.
+
+    Held, its last noise would push the joint for as long as nothing is read.
+    """
+    lost_radps = state.error_rate_radps * -math.expm1(-elapsed_cycles * constants.period_s / COAST_s)
+    state.error_rate_radps -= lost_radps
+    state.velocity_radps -= lost_radps
 
 
 # --- Error, its rate and a disturbance by a Kalman filter: for an encoder too coarse for differences ---

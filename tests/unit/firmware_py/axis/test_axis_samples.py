@@ -22,6 +22,20 @@ def test_missing_samples_are_bridged_by_the_velocity(rig: NewRig) -> None:
     assert_well(run)
 
 
+def test_a_velocity_that_is_wrong_does_not_push_for_as_long_as_nothing_is_read(rig: NewRig) -> None:
+    """The last one may be noise, or the answer to a swing that is over: it comes to that of the reference."""
+    run = rig(0.0).until(AxisPhase.TRACKING).run(100)
+    velocity = run.state.velocity
+    velocity.velocity_radps += 0.1
+    velocity.error_rate_radps += 0.1
+    wrong_Nm = []
+    for _ in range(60):
+        run.tick(fresh=False)
+        wrong_Nm.append(abs(run.torques_Nm[-1]))
+    assert velocity.velocity_radps == pytest.approx(run.state.reference.velocity_radps, abs=0.002)
+    assert wrong_Nm[-1] < 0.3 * max(wrong_Nm)
+
+
 @pytest.mark.parametrize("overrun", [False, True])
 @pytest.mark.parametrize(("moved_rad", "fault"), [(0.0799, Fault.NONE), (0.0801, Fault.POSITION_JUMP)])
 def test_a_jump_is_measured_per_period_after_lost_samples_and_an_overrun(
