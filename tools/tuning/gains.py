@@ -73,7 +73,7 @@ LEARNING_FACTOR = 0.9  # of a repetition, wanted
 SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
-_STARTS, _EVALUATIONS = 2, 90
+_STARTS, _EVALUATIONS = 3, 90
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,14 @@ class Law:
             values["q"] = (values["q"], values["q"])
         return replace(settings, **values)
 
-    def logarithms(self, settings: LoopSettings) -> Array:
-        """What `settings` takes."""
-        return np.log([np.max(getattr(settings, key)) for key in self.keys])
+    def starts(self, best_first: list[Judged]) -> list[Array]:
+        """Where to search: the best ones, each in a valley of its own, since a filter far lower bears other gains."""
+        found: list[Array] = []
+        for one in best_first:
+            x = np.log([np.max(getattr(one.settings, key)) for key in self.keys])
+            if all(abs(x[-1] - other[-1]) > 1.0 for other in found):
+                found.append(x)
+        return found[:_STARTS]
 
 
 LAWS = {
@@ -366,8 +371,7 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
         if not search.tried:
             for point in product(*(np.geomspace(*span) for span in law.spans)):
                 search.judged(np.log(point))
-        for start in sorted(search.tried, key=lambda one: cost(one, least_error))[:_STARTS]:
-            x = law.logarithms(start.settings)
+        for x in law.starts(sorted(search.tried, key=lambda one: cost(one, least_error))):
             minimize(
                 lambda x: cost(search.judged(x), least_error), x, method="Nelder-Mead",
                 options={

@@ -1,10 +1,9 @@
 """Rigid or two-mass model of a joint, fitted to its frequency response with delay and lag of the current loop.
 
-Both are `linear_loop`'s sampled joint, and its reducer also loses what hysteresis takes, the same share at every
-frequency; a rigid joint is the motor's mass alone.  Least squares of the relative error of every line, weighted by its
-interval, with a soft loss, from several starts.  The model with two masses is taken where the data tell it from the
-rigid one (Bayes' information criterion).  Intervals are those of the linearised fit, as wide as its residuals say, and
-of inertias and delay what friction adds.
+Both are `linear_loop`'s sampled joint, and the reducer also has hysteresis; a rigid joint is the motor's mass alone.
+Least squares of the relative error of every line, weighted by its interval, with a soft loss, from several starts.  The
+model with two masses is taken where the data tell it from the rigid one (Bayes' information criterion).  Intervals are
+those of the linearised fit, as wide as its residuals say, and of inertias and delay what friction adds.
 """
 
 from __future__ import annotations
@@ -120,13 +119,19 @@ def fit_from_dict(found: dict[str, Any]) -> JointFit:
 def _response(
     joint: TwoMasses, loss: float, delay_s: float, lag_s: float, period_s: float, frequency_Hz: np.ndarray
 ) -> dict[str, ComplexArray]:
-    """Of the sampled joint, as `sampled_joint` has it, whose spring K (1 + j loss) also loses what hysteresis takes.
+    """Of the sampled joint, as `sampled_joint` has it, whose spring is that of a reducer with hysteresis.
 
-    In continuous time behind a hold, summed over the frequencies that a sample cannot tell apart.
+        K (f / resonance)^(loss / pi) (1 + j loss)
+
+    It loses the same share at every frequency, and is stiffer for the smaller motion of a higher one.  In continuous
+    time behind a hold, summed over the frequencies that a sample cannot tell apart.
     """
     omega = math.tau * (frequency_Hz + _ALIASES[:, None] / period_s)
     s = 1j * omega
-    spring = joint.stiffness_Nmprad * (1.0 + 1j * loss * np.sign(omega)) + joint.damping_Nmspr * s
+    spring = joint.damping_Nmspr * s
+    if joint.stiffness_Nmprad > 0.0:
+        stiffer = np.abs(omega / (math.tau * joint.resonance_Hz)) ** (loss / math.pi)
+        spring = spring + joint.stiffness_Nmprad * stiffer * (1.0 + 1j * loss * np.sign(omega))
     motor = (joint.motor_kgm2 * s + joint.bristle_damping_Nmspr[0]) * s + spring
     link = (joint.link_kgm2 * s + joint.bristle_damping_Nmspr[1]) * s + spring
     torque = np.exp(-delay_s * s) * (1.0 - np.exp(-period_s * s)) / ((1.0 + lag_s * s) * period_s * s)
@@ -164,7 +169,7 @@ def _used(found: FrequencyResponse) -> list[_Data]:
 class _Model:
     """Parameters, logarithms but for B and loss: (J, delay, lag, B), and (link / motor, resonance, damping, loss).
 
-    The loss, which is the same at every frequency, is that of hysteresis: as damping alone it would look like delay.
+    The loss is that of hysteresis: as damping alone it would look like delay.
     """
 
     def __init__(self, parts: list[_Data], period_s: float, flexible: bool) -> None:

@@ -223,12 +223,13 @@ def test_two_masses_are_found_with_intervals_from_a_wrong_guess(seed: int) -> No
 
 @pytest.mark.parametrize("loss", [0.0, 0.25])
 def test_what_hysteresis_loses_is_not_taken_for_delay(loss: float) -> None:
-    """A spring that loses the same share at every frequency, against that of the sampled joint in continuous time."""
+    """A spring with hysteresis, in continuous time, against that of the sampled joint."""
     found = made_response(SOFT, (1.3e-3, 0.6e-3))
 
     def continuous(share: float) -> np.ndarray:
         s = 2j * math.pi * found.frequency_Hz
-        spring = SOFT.stiffness_Nmprad * (1.0 + 1j * share) + SOFT.damping_Nmspr * s
+        stiffer = (found.frequency_Hz / SOFT.resonance_Hz) ** (share / math.pi)
+        spring = SOFT.stiffness_Nmprad * stiffer * (1.0 + 1j * share) + SOFT.damping_Nmspr * s
         motor, link = (
             SOFT.motor_kgm2 * s**2 + SOFT.bristle_damping_Nmspr[0] * s + spring,
             SOFT.link_kgm2 * s**2 + spring,
