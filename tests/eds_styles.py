@@ -128,6 +128,10 @@ SIMPLIQ = Style(
     )),
     "rated_current", refusal="object is read only",
 )  # fmt: skip
+EPOS4_KEYS: dict[str, object] = {  # of [drive] in a copy of virtual.toml; 5 A are its rated torque, 3001:2 is in mA
+    "eds": "maker.eds", "rated_current_A": None, "max_torque_permille": None, "temperature_object": None,
+    "temperature_unit_degC": None, "torque_limit_object": "3001:2", "torque_limit_rated_counts": 5000.0,
+}  # fmt: skip
 STYLES = (GOLD, EPOS4, NANOTEC, NANOTEC_OLD, IPOS, SIMPLIQ)
 
 

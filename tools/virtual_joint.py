@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import astuple
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -33,7 +34,13 @@ from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantConstants
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import ArmConfig
-from jointctl.tools.configuration.canopen import CanopenSection, canopen_section, eds_path, encoder_eds_path
+from jointctl.tools.configuration.canopen import (
+    CanopenSection,
+    canopen_section,
+    eds_path,
+    encoder_eds_path,
+    torque_limit_object,
+)
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, first_on_bus, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
@@ -159,6 +166,7 @@ def device_settings(config: Config) -> DeviceSettings:
         torque_direction=drive.torque_direction,
         vendor_id=drive.vendor_id or vendor_id or 0,
         product_code=drive.product_code or product_code or 1,
+        torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
         **_drive_loops(drive),

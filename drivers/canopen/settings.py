@@ -40,6 +40,15 @@ class TemperatureObject:
 
 
 @dataclass(frozen=True)
+class TorqueLimitObject:
+    """The maker's own object that limits torque or current: it holds `rated_counts` where 6071 holds 1000 permille."""
+
+    index: int
+    sub: int
+    rated_counts: float
+
+
+@dataclass(frozen=True)
 class CanopenSettings:
     """See the sections [drive], [encoder] and [joint] of the configuration."""
 
@@ -79,3 +88,4 @@ class CanopenSettings:
     following_error_max_rad: float = 0.0  # at the joint, for the drive's own window in CSP
     holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any
+    torque_limit: TorqueLimitObject | None = None  # where the drive has no 6072, or beside it

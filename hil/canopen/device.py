@@ -48,6 +48,9 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
+    torque_limit: tuple[int, int, float] | None = (
+        None  # the maker's own limit: index, sub, what it holds at rated torque
+    )
     shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
 
     def __post_init__(self) -> None:
@@ -158,6 +161,8 @@ class Cia402Device:
         objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
         objects.set_default(0x6075, 0, settings.rated_current_mA)
         objects.set_default(0x6076, 0, settings.rated_torque_mNm)
+        if settings.torque_limit is not None and objects.limit_torque_by(*settings.torque_limit):
+            device.makers_limit_rated_counts = settings.torque_limit[2]
         identity = (settings.vendor_id, settings.product_code, settings.revision, settings.serial_number)
         for sub, value in enumerate(identity, 1):
             objects.set_default(0x1018, sub, value)
