@@ -22,6 +22,7 @@ import numpy as np
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm
 from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.arm_plant import ArmPlant, arm_plant
@@ -157,10 +158,12 @@ def device_settings(config: Config) -> DeviceSettings:
         raise ConfigurationError(
             "drive.rated_current_A or drive.rated_torque_Nm is missing: the virtual drive needs it"
         )
+    unit_mNm = RATED_TORQUE_UNITS_mNm[drive.rated_torque_unit]
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((current_A or (torque_Nm or 0.0) / constant_NmpA) * 1000.0),
-        rated_torque_mNm=round((torque_Nm or (current_A or 0.0) * constant_NmpA) * 1000.0),
+        rated_torque_mNm=round((torque_Nm or (current_A or 0.0) * constant_NmpA) * 1000.0 / unit_mNm) * unit_mNm,
+        rated_torque_unit_mNm=unit_mNm,
         reduction_ratio=config.joint.reduction_ratio,
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
         torque_direction=drive.torque_direction,

@@ -19,6 +19,7 @@ from jointctl.drivers.canopen.pdo import (
     TARGET_TORQUE,
     TARGET_VELOCITY,
     PdoLayout,
+    RATED_TORQUE_UNITS_mNm,
     configure_loop_pdos,
     joint_angle_per_count_rad,
     joint_torque_per_permille_Nm,
@@ -279,7 +280,9 @@ def _compare_rated(name: str, found: float, expected: float | None, tolerance: f
     if found == 0.0:
         raise DeviceError(f"drive.{name} (={expected:g}) cannot be compared: the drive does not tell its rated value")
     if abs(found - expected) > tolerance * expected:
-        raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
+        text = f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}"
+        finer = unit == "Nm" and abs(found * 1e-3 - expected) <= tolerance * expected
+        raise DeviceError(text, 'a drive whose 6076 counts µNm: drive.rated_torque_unit = "uNm"' if finer else "")
     return []
 
 
@@ -348,9 +351,9 @@ def lower_makers_limit(
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """Scaling from the rated values, then the drive's own torque limit (6072, or the maker's own) from the joint's."""
-    torque_mNm = objects.read_if_present(0x6076, what="motor rated torque")
+    torque = objects.read_if_present(0x6076, what="motor rated torque")
     current_mA = objects.read_if_present(0x6075, what="motor rated current")
-    rated_mNm, rated_mA = torque_mNm or 0, current_mA or 0
+    rated_mNm, rated_mA = (torque or 0) * RATED_TORQUE_UNITS_mNm[settings.rated_torque_unit], current_mA or 0
     tolerance = settings.rated_tolerance
     findings.remarks += [
         *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
@@ -359,7 +362,7 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
     if scale <= 0.0:
         of_torque = settings.torque_reference == "rated_torque"
-        index, found = ("6076", torque_mNm) if of_torque else ("6075", current_mA)
+        index, found = ("6076", torque) if of_torque else ("6075", current_mA)
         why = f"it has no object {index}" if found is None else f"object {index} is 0"
         raise DeviceError(f"node {settings.node}: {why}, so 6071 has no scale (drive.torque_reference)")
     findings.torque_per_permille_Nm = scale

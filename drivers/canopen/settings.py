@@ -73,6 +73,7 @@ class CanopenSettings:
     product_code: int | None = None
     rated_current_A: float | None = None
     rated_torque_Nm: float | None = None
+    rated_torque_unit: str = "mNm"  # of 6076: a key of `pdo.RATED_TORQUE_UNITS_mNm`
     rated_tolerance: float = 0.01
     max_torque_permille: int | None = None
     velocity_unit: str = "counts/s"  # of 60FF: a key of `pdo.VELOCITY_UNITS`

@@ -83,6 +83,7 @@ class CanopenSection(DriveSection):
     product_code: Identity | None = None  # expected in 1018:2; none = any
     rated_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None  # compared with 6075
     rated_torque_Nm: Annotated[float, between(0.0, 10_000.0, open_low=True)] | None = None  # motor; compared with 6076
+    rated_torque_unit: Literal["mNm", "uNm"] = "mNm"  # of 6076: mNm, or µNm as maxon's EPOS4 has it
     rated_tolerance: Annotated[float, between(0.0, 0.2)] = 0.01  # of the comparisons with 6075 and 6076, relative
     torque_reference: Literal["rated_torque", "rated_current"]  # what 1000 permille of 6071 and 6077 mean
     max_torque_permille: Annotated[int, between(1, 10_000)] | None = None  # 6072; none = derived from torque_max_Nm

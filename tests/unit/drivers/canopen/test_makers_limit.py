@@ -159,3 +159,15 @@ def test_a_drive_with_both_gets_both(tmp_path: Path) -> None:
 def test_what_the_keys_may_not_be(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         load_config(written(tmp_path / "joint.toml", **keys(**changes)))
+
+
+@pytest.mark.parametrize("unit", ["uNm", "mNm"])
+def test_a_rated_torque_in_micronewton_metres(epos: DeviceOnBus, unit: str) -> None:
+    assert epos.value(0x6076) == 500_000
+    with epos.opened(rated_torque_unit=unit) as drive:
+        if unit == "uNm":
+            assert drive.commission().torque_resolution_Nm == pytest.approx(0.0605)
+            return
+        with refusal(r"rated_torque_Nm \(=0\.5\) does not agree with the drive's 500 Nm") as refused:
+            drive.commission()
+    assert 'drive.rated_torque_unit = "uNm"' in refused.value.hint
