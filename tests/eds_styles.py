@@ -96,7 +96,8 @@ EPOS4 = Style(  # no 6072, 6075, 6087: the limit is an object of the maker's own
     "maxon EPOS4", 0xFB, 0x225,
     (*_communication(2), *_drive(
         0x225, Listed(0x6007, 0, I16, "rw", "3"), Listed(0x6076, 0, U32, "rw", "0"), Listed(0x60C2, 1, U8),
-        Listed(0x60C2, 2, I8), Listed(0x60E4, 1, I32, "ro"), Listed(0x3001, 2, U32, "rw", "5000"),
+        Listed(0x60C2, 2, I8), Listed(0x60E4, 1, I32, "ro"), Listed(0x3001, 1, U32, "rw", "5000"),
+        Listed(0x3001, 2, U32, "rw", "5000"),
     )),
     refusal="has no object 6072 (max torque)",
 )  # fmt: skip
@@ -128,6 +129,12 @@ SIMPLIQ = Style(
     )),
     "rated_current", refusal="object is read only",
 )  # fmt: skip
+# of [drive] in a copy of virtual.toml; 5 A yield its rated torque, 3001:2 counts mA, 6076 counts µNm
+EPOS4_KEYS: dict[str, object] = {
+    "eds": "maker.eds", "rated_current_A": None, "max_torque_permille": None, "temperature_object": None,
+    "temperature_unit_degC": None, "rated_torque_unit": "uNm",
+    "torque_limit_object": "3001:2", "torque_limit_rated_counts": 5000.0,
+}  # fmt: skip
 STYLES = (GOLD, EPOS4, NANOTEC, NANOTEC_OLD, IPOS, SIMPLIQ)
 
 

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import astuple
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -21,6 +22,7 @@ import numpy as np
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm
 from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.arm_plant import ArmPlant, arm_plant
@@ -33,7 +35,13 @@ from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantConstants
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import ArmConfig
-from jointctl.tools.configuration.canopen import CanopenSection, canopen_section, eds_path, encoder_eds_path
+from jointctl.tools.configuration.canopen import (
+    CanopenSection,
+    canopen_section,
+    eds_path,
+    encoder_eds_path,
+    torque_limit_object,
+)
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, first_on_bus, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
@@ -150,15 +158,18 @@ def device_settings(config: Config) -> DeviceSettings:
         raise ConfigurationError(
             "drive.rated_current_A or drive.rated_torque_Nm is missing: the virtual drive needs it"
         )
+    unit_mNm = RATED_TORQUE_UNITS_mNm[drive.rated_torque_unit]
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((current_A or (torque_Nm or 0.0) / constant_NmpA) * 1000.0),
-        rated_torque_mNm=round((torque_Nm or (current_A or 0.0) * constant_NmpA) * 1000.0),
+        rated_torque_mNm=round((torque_Nm or (current_A or 0.0) * constant_NmpA) * 1000.0 / unit_mNm) * unit_mNm,
+        rated_torque_unit_mNm=unit_mNm,
         reduction_ratio=config.joint.reduction_ratio,
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
         torque_direction=drive.torque_direction,
         vendor_id=drive.vendor_id or vendor_id or 0,
         product_code=drive.product_code or product_code or 1,
+        torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
         **_drive_loops(drive),

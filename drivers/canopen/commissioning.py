@@ -19,6 +19,7 @@ from jointctl.drivers.canopen.pdo import (
     TARGET_TORQUE,
     TARGET_VELOCITY,
     PdoLayout,
+    RATED_TORQUE_UNITS_mNm,
     configure_loop_pdos,
     joint_angle_per_count_rad,
     joint_torque_per_permille_Nm,
@@ -26,8 +27,8 @@ from jointctl.drivers.canopen.pdo import (
     listen_to_our_sync,
     map_velocity_offset,
 )
-from jointctl.drivers.canopen.sdo import ObjectAccess
-from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.sdo import ObjectAccess, object_name
+from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
 from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline
 from jointctl.drivers.drive import DriveIdentity
@@ -58,6 +59,9 @@ STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the l
 STEEP_PERMILLE_PS = 1_000_000
 TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"
 LONGEST_PERIOD = 255  # of 60C2:1
+MAX_TORQUE, TORQUE_LIMIT = "max torque", "torque limit"
+RATED_PERMILLE = 1000.0
+ROUNDING = 1e-9  # of a quotient that should be a whole number
 LARGEST_PERMILLE = 32767  # 6071 is a signed 16 bit number
 ATTEMPTS = 20
 PAUSE_S = 0.01  # between two looks at a drive that was commanded to change its state or mode
@@ -276,7 +280,9 @@ def _compare_rated(name: str, found: float, expected: float | None, tolerance: f
     if found == 0.0:
         raise DeviceError(f"drive.{name} (={expected:g}) cannot be compared: the drive does not tell its rated value")
     if abs(found - expected) > tolerance * expected:
-        raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
+        text = f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}"
+        finer = unit == "Nm" and abs(found * 1e-3 - expected) <= tolerance * expected
+        raise DeviceError(text, 'a drive whose 6076 counts µNm: drive.rated_torque_unit = "uNm"' if finer else "")
     return []
 
 
@@ -304,11 +310,50 @@ def set_torque_slope(objects: ObjectAccess, torque_per_permille_Nm: float, torqu
     return [TQ_REMARK] if slope == STEEP_PERMILLE_PS else [f"{TQ_REMARK}; 6087 = {slope} permille/s"]
 
 
+def _write_max_torque(objects: ObjectAccess, permille: int) -> None:
+    """6072; a drive without it is refused, unless its maker's own limit is configured."""
+    try:
+        objects.write_verified(0x6072, 0, permille, what=MAX_TORQUE)
+    except DeviceError as error:
+        if not objects.lack(0x6072):
+            raise
+        other = "unless drive.torque_limit_object names the maker's own object that limits torque or current"
+        raise DeviceError(error.message, f"{error.hint}, {other}") from error.__cause__
+
+
+def lower_makers_limit(
+    objects: ObjectAccess, settings: CanopenSettings, limit: TorqueLimitObject, permille_Nm: float
+) -> str:
+    """Bound the torque by the maker's own object to `torque_max_Nm`, rounded down; in words.
+
+    Other than 6072, it is where the maker's software keeps what motor and drive bear.  So it is only lowered, which
+    bounds a wrong unit too, and holds its old value again when the drive has been made safe.
+    """
+    index, sub, name = limit.index, limit.sub, object_name(limit.index, limit.sub)
+    count_Nm = RATED_PERMILLE * permille_Nm / limit.rated_counts
+    counts = math.floor(settings.torque_max_Nm / count_Nm * (1.0 + ROUNDING))
+    if counts < 1:
+        raise DeviceError(
+            f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) is below one count of object {name} (torque limit), "
+            f"{count_Nm:g} Nm by drive.torque_limit_rated_counts (={limit.rated_counts:g})"
+        )
+    before = objects.read(index, sub, what=TORQUE_LIMIT)
+    if before < counts:
+        raise DeviceError(
+            f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) needs {counts} in object {name} (torque limit), which "
+            f"holds {before} = {before * count_Nm:g} Nm and is only ever lowered",
+            "correct drive.torque_limit_rated_counts, or set the limit in the maker's software; if a run was killed, "
+            "restart the drive",
+        )
+    objects.lower(index, sub, counts, before, what=TORQUE_LIMIT)
+    return f"{name} = {counts} (was {before}) = {counts * count_Nm:.1f} Nm"
+
+
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """Scaling from the rated values, then the drive's own torque limit 6072 from the joint's."""
-    torque_mNm = objects.read_if_present(0x6076, what="motor rated torque")
+    """Scaling from the rated values, then the drive's own torque limit (6072, or the maker's own) from the joint's."""
+    torque = objects.read_if_present(0x6076, what="motor rated torque")
     current_mA = objects.read_if_present(0x6075, what="motor rated current")
-    rated_mNm, rated_mA = torque_mNm or 0, current_mA or 0
+    rated_mNm, rated_mA = (torque or 0) * RATED_TORQUE_UNITS_mNm[settings.rated_torque_unit], current_mA or 0
     tolerance = settings.rated_tolerance
     findings.remarks += [
         *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
@@ -317,7 +362,7 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
     if scale <= 0.0:
         of_torque = settings.torque_reference == "rated_torque"
-        index, found = ("6076", torque_mNm) if of_torque else ("6075", current_mA)
+        index, found = ("6076", torque) if of_torque else ("6075", current_mA)
         why = f"it has no object {index}" if found is None else f"object {index} is 0"
         raise DeviceError(f"node {settings.node}: {why}, so 6071 has no scale (drive.torque_reference)")
     findings.torque_per_permille_Nm = scale
@@ -333,10 +378,18 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     findings.max_permille = min(permille, LARGEST_PERMILLE)
     if findings.max_permille < permille:
         findings.remarks.append(f"6072 holds at most {LARGEST_PERMILLE} permille: torque is limited to that")
-    objects.write_verified(0x6072, 0, findings.max_permille, what="max torque")
+    limits = []
+    if settings.torque_limit is None:
+        _write_max_torque(objects, findings.max_permille)
+    else:
+        limits.append(lower_makers_limit(objects, settings, settings.torque_limit, scale))
+    if settings.torque_limit is None or objects.write_if_present(0x6072, 0, findings.max_permille, what=MAX_TORQUE):
+        limits.insert(0, f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm")
+    else:
+        findings.remarks.append(f"no object 6072: the drive limits its torque by {limits[0]}")
     if findings.mode is Mode.TORQUE:
         findings.remarks += set_torque_slope(objects, scale, settings.torque_rate_max_Nmps)
-    findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
+    findings.settings["max torque"] = ", ".join(limits)
 
 
 def interpolation_period(rate_Hz: float) -> tuple[int, int]:

@@ -365,7 +365,8 @@ class CanopenDrive:
 
         A drive that `commission` has not taken over is left alone, and so is one that another controller has taken
         before our loop was started: its motion is not ours to end.  `asked`: the user wants a stop, whose frames look
-        like another controller's.  The watchdog that we have armed is taken away when the drive is off.
+        like another controller's.  The watchdog that we have armed is taken away when the drive is off, and the
+        maker's own limit that we have lowered is given back.
         """
         self._gate = self._objects.gate = lambda: None
         if not self._taken:
@@ -383,6 +384,8 @@ class CanopenDrive:
         if is_safe(state):
             with contextlib.suppress(JointctlError, can.CanError):
                 self._take_watchdog_away()
+            with contextlib.suppress(JointctlError, can.CanError):
+                self._objects.give_limits_back()
         return state
 
     def _take_watchdog_away(self) -> None:

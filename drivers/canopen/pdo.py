@@ -364,10 +364,11 @@ def _use_as_it_is(objects: ObjectAccess, pdo: PdoMap, kind: int) -> PdoMap:
 
 PERMILLE = 1000.0
 # units of 60FF besides the encoder's counts per second: motor speed [rad/s] of one unit
+RATED_TORQUE_UNITS_mNm = {"mNm": 1.0, "uNm": 1e-3}
 VELOCITY_UNITS = {"counts/s": None, "r/min": math.tau / 60.0, "0.1 r/min": math.tau / 600.0}
 
 
-def joint_torque_per_permille_Nm(settings: CanopenSettings, rated_torque_mNm: int, rated_current_mA: int) -> float:
+def joint_torque_per_permille_Nm(settings: CanopenSettings, rated_torque_mNm: float, rated_current_mA: int) -> float:
     """Joint torque [Nm] of 1/1000 of rated in objects 6071 and 6077, without the direction."""
     if settings.torque_reference == "rated_torque":
         motor_Nm = rated_torque_mNm * 1e-3

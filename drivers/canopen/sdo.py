@@ -120,6 +120,7 @@ class ObjectAccess:
         self.remarks: list[str] = []  # what was tolerated
         self.gate: Callable[[], None] = lambda: None  # raises where nothing more may be sent to the drive
         self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
+        self._lowered: dict[tuple[int, int], tuple[int, int, str]] = {}  # limits: what they held, hold now, their name
         self._answered: dict[tuple[int, int], bool] = {}  # whether the drive has what the EDS lists
 
     def has(self, index: int, sub: int = 0) -> bool:
@@ -263,6 +264,25 @@ class ObjectAccess:
             raise DeviceError(f"{place} reads back {found}, {value} was written")
         self._verified[index, sub] = value, what
         return found
+
+    def lower(self, index: int, sub: int, value: int, before: int, *, what: str) -> None:
+        """`write_verified` of a limit that held `before`, which `give_limits_back` writes again."""
+        held, lowered, _ = self._lowered.get((index, sub), (before, before, what))
+        self._lowered[index, sub] = (held if lowered == before else before), value, what
+        try:
+            self.write_verified(index, sub, value, what=what)
+        except DeviceError as error:
+            del self._lowered[index, sub]
+            if not was_refused(error):  # it holds something else now
+                self.write(index, sub, before, what=what)
+            raise
+
+    def give_limits_back(self) -> None:
+        """Limits that `lower` has written hold what they held before; one that another program has set since stays."""
+        while self._lowered:
+            (index, sub), (before, lowered, what) = self._lowered.popitem()
+            if self.read(index, sub, what=what) == lowered != before:
+                self.write_verified(index, sub, before, what=what)
 
     def verified(self) -> dict[tuple[int, int], tuple[int, str]]:
         """What was written and read back since commissioning began: (index, sub) -> value and name."""

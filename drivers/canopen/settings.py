@@ -40,6 +40,15 @@ class TemperatureObject:
 
 
 @dataclass(frozen=True)
+class TorqueLimitObject:
+    """The maker's own object that limits torque or current: it holds `rated_counts` where 6071 holds 1000 permille."""
+
+    index: int
+    sub: int
+    rated_counts: float
+
+
+@dataclass(frozen=True)
 class CanopenSettings:
     """See the sections [drive], [encoder] and [joint] of the configuration."""
 
@@ -64,6 +73,7 @@ class CanopenSettings:
     product_code: int | None = None
     rated_current_A: float | None = None
     rated_torque_Nm: float | None = None
+    rated_torque_unit: str = "mNm"  # of 6076: a key of `pdo.RATED_TORQUE_UNITS_mNm`
     rated_tolerance: float = 0.01
     max_torque_permille: int | None = None
     velocity_unit: str = "counts/s"  # of 60FF: a key of `pdo.VELOCITY_UNITS`
@@ -79,3 +89,4 @@ class CanopenSettings:
     following_error_max_rad: float = 0.0  # at the joint, for the drive's own window in CSP
     holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any
+    torque_limit: TorqueLimitObject | None = None  # where the drive has no 6072, or beside it

@@ -31,7 +31,8 @@ class DeviceSettings:
 
     node_id: int = 1
     rated_current_mA: int = 5000
-    rated_torque_mNm: int = 500  # motor side
+    rated_torque_mNm: float = 500  # motor side
+    rated_torque_unit_mNm: float = 1.0  # of 6076
     reduction_ratio: float = 121.0
     motor_torque_constant_NmpA: float | None = None
     vendor_id: int = 0
@@ -48,6 +49,9 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
+    torque_limit: tuple[int, int, float] | None = (
+        None  # the maker's own limit: index, sub, what it holds at rated torque
+    )
     shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
 
     def __post_init__(self) -> None:
@@ -144,6 +148,7 @@ class Cia402Device:
         settings, device, objects = self.settings, self.device[0], self.objects
         device.node_id = settings.node_id
         device.reduction_ratio = settings.reduction_ratio
+        device.rated_torque_unit_mNm = settings.rated_torque_unit_mNm
         device.motor_torque_constant_NmpA = settings.torque_constant_NmpA
         device.velocity_gain_Nmspr = settings.velocity_gain_Nmspr
         device.velocity_integral_Nmprad = settings.velocity_integral_Nmprad
@@ -157,7 +162,9 @@ class Cia402Device:
         objects.set_default(0x608F, 1, round(abs(device.counts_per_rad) * 2.0 * math.pi))
         objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
         objects.set_default(0x6075, 0, settings.rated_current_mA)
-        objects.set_default(0x6076, 0, settings.rated_torque_mNm)
+        objects.set_default(0x6076, 0, round(settings.rated_torque_mNm / settings.rated_torque_unit_mNm))
+        if settings.torque_limit is not None and objects.limit_torque_by(*settings.torque_limit):
+            device.makers_limit_rated_counts = settings.torque_limit[2]
         identity = (settings.vendor_id, settings.product_code, settings.revision, settings.serial_number)
         for sub, value in enumerate(identity, 1):
             objects.set_default(0x1018, sub, value)

@@ -48,6 +48,7 @@ from jointctl.hil.canopen.motion import (
     following_error_tripped,
     follows_velocity,
     is_powered,
+    rated_torque_mNm,
 )
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
@@ -270,7 +271,7 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     drive.velocity = _int32(shaft_velocity_radps(plant_c, plant_s) * device.counts_per_rad)
     current_A = device.torque_sign * plant_s.current_A
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * current_A / device.reduction_ratio
-    drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
+    drive.torque = _int16(1e3 * motor_torque_mNm / rated_torque_mNm(device))
     drive.current = _int16(1e6 * current_A / int64(drive.rated_current_mA))
     drive.motor_temperature_ddegC = _int16(10.0 * plant_s.motor_temperature_degC)
     drive.demand_torque = _int16(device.torque_sign * device.demand)

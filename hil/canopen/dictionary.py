@@ -27,6 +27,7 @@ _TYPES = {1: "u1", 2: "i1", 3: "<i2", 4: "<i4", 5: "u1", 6: "<u2", 7: "<u4"}
 _OTHER_TYPES = {0x15: "<i8", 0x1B: "<u8"}  # of another drive's EDS; the core has none of them
 _BYTES = {8: 4, 0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7}  # kept as they come
 _VISIBLE_STRING = 9
+MAKERS_LIMIT_BYTES = 4  # of `DriveObjects.makers_limit`
 
 TOGGLE_ERROR = 0x05030000
 TIMED_OUT = 0x05040000
@@ -169,6 +170,7 @@ class ObjectDictionary:
     def __init__(
         self, eds_path: Path, node_id: int, memory: np.recarray, shown: canopen.ObjectDictionary | None = None
     ) -> None:
+        self._memory = memory
         self._take_entries(load_entries(eds_path, node_id))
         for key, field in FIELDS.items():
             if key not in self.entries:
@@ -228,6 +230,22 @@ class ObjectDictionary:
             bits = [int(self._initial[index, sub][0]) & 0xFF for sub in range(1, min(int(count[0]), MAPPED) + 1)]
             if count[0] > MAPPED or sum(bits) > 64 or any(size % 8 for size in bits):
                 count[0] = 0
+
+    def limit_torque_by(self, index: int, sub: int, rated_counts: float) -> bool:
+        """Make a number of the maker's own the core's limit; False if it is none, or one that the core has already.
+
+        A default of 0 counts as left open: twice the rated value.
+        """
+        key, entry = (index, sub), self.entries.get((index, sub))
+        if entry is None or entry.dtype is None or key in self._live or entry.size > MAKERS_LIMIT_BYTES:
+            return False
+        default = int(entry.default) or min(round(2.0 * rated_counts), int(np.iinfo(entry.dtype).max))
+        for views, group in ((self._live, "drive"), (self._initial, "default_drive")):
+            view = field_view(self._memory, (group,), "makers_limit")
+            views[key] = view.view(np.uint8)[: entry.size].view(entry.dtype)
+        self._default_strings.pop(key, None)
+        self.set_default(*key, default)
+        return True
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self.entries.values())

@@ -23,17 +23,26 @@ _UNLIMITED_WINDOW = 0xFFFFFFFF
 
 
 @kernel
+def rated_torque_mNm(device: Device) -> float:
+    """6076 in its unit."""
+    return int64(device.drive.rated_torque) * device.rated_torque_unit_mNm
+
+
+@kernel
 def torque_limit(device: Device) -> float:
-    """The smaller of 6072 and of what current 6073 yields [per mille of rated motor torque]."""
+    """The least of 6072, what current 6073 yields and the maker's own limit [per mille of rated motor torque]."""
     drive = device.drive
-    per_current = device.motor_torque_constant_NmpA * int64(drive.rated_current_mA) / int64(drive.rated_torque_mNm)
-    return min(float(drive.max_torque), float(drive.max_current) * per_current)
+    per_current = device.motor_torque_constant_NmpA * int64(drive.rated_current_mA) / rated_torque_mNm(device)
+    bound = min(float(drive.max_torque), float(drive.max_current) * per_current)
+    if device.makers_limit_rated_counts > 0.0:
+        bound = min(bound, 1000.0 * int64(drive.makers_limit) / device.makers_limit_rated_counts)
+    return bound
 
 
 @kernel
 def permille_torque_Nm(device: Device) -> float:
     """Joint torque of one per mille of the rated motor torque [Nm]."""
-    return 1e-6 * int64(device.drive.rated_torque_mNm) * device.reduction_ratio
+    return 1e-6 * rated_torque_mNm(device) * device.reduction_ratio
 
 
 @kernel

@@ -203,7 +203,7 @@ class DriveObjects:
     max_current: Annotated[u2, At(0x6073)]
     demand_torque: Annotated[i2, At(0x6074)]
     rated_current_mA: Annotated[u4, At(0x6075)]
-    rated_torque_mNm: Annotated[u4, At(0x6076)]
+    rated_torque: Annotated[u4, At(0x6076)]
     torque: Annotated[i2, At(0x6077)]
     current: Annotated[i2, At(0x6078)]
     dc_link_mV: Annotated[u4, At(0x6079)]
@@ -230,6 +230,7 @@ class DriveObjects:
     following_error: Annotated[i4, At(0x60F4)]
     target_velocity: Annotated[i4, At(0x60FF)]
     supported_modes: Annotated[u4, At(0x6502)]
+    makers_limit: u4  # the maker's own limit, at whatever index the drive that is shown has it
 
 
 @record
@@ -247,6 +248,8 @@ class Device:
     node_id: i4
     reduction_ratio: f8
     counts_per_rad: f8  # at the joint; negative when the encoder counts against the joint
+    makers_limit_rated_counts: f8  # what `makers_limit` holds at rated torque; 0 = there is no such object
+    rated_torque_unit_mNm: f8  # of 6076
     motor_torque_constant_NmpA: f8  # turns the current limit 6073 into a torque limit
     velocity_gain_Nmspr: f8
     velocity_integral_Nmprad: f8

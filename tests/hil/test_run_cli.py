@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState
+from tests.eds_styles import EPOS4, EPOS4_KEYS, eds_text
 from tests.hil.terminal import Terminal
 
 LARGEST_STEP_radps = 0.02  # of the desired velocity in one cycle; braking at 2 rad/s2 is a tenth of it
@@ -57,6 +58,20 @@ def test_a_motor_that_warms_up_is_seen_in_summary_log_and_export(bench: Any) -> 
     assert read["temperature_degC"][[0, -1]].tolist() == [told["least"], told["greatest"]]
     assert 3 <= len(read) <= 10
     assert np.all(np.diff(read["time_ns"]) > 0.5e9)  # a busy computer answers late
+
+
+def test_a_drive_without_6072_runs_within_its_makers_limit_and_has_it_back(bench: Any) -> None:
+    (bench.folder / "maker.eds").write_text(eds_text(EPOS4), encoding="latin-1")
+    config = bench.config(**{f"drive__{key}": value for key, value in EPOS4_KEYS.items()})
+    bench.joint(config)
+    done = bench.run("run", config, "-y")
+    assert done.code == 0, done.err
+    assert "no object 6072: the drive limits its torque by 3001:2 = 4958 (was 5000) = 60.0 Nm" in done.err
+    network = bench.network()
+    try:
+        assert int.from_bytes(network.add_node(1).sdo.upload(0x3001, 2), "little") == 5000
+    finally:
+        network.disconnect()
 
 
 @pytest.mark.trips("supervisor: the user")

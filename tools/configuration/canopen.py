@@ -12,7 +12,12 @@ from pydantic_core import PydanticCustomError
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import split_channel
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
-from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
+from jointctl.drivers.canopen.settings import (
+    CanopenSettings,
+    JointEncoderSettings,
+    TemperatureObject,
+    TorqueLimitObject,
+)
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
@@ -28,6 +33,7 @@ from jointctl.tools.configuration.drive_section import (
 from jointctl.tools.configuration.sections import (
     Bus,
     Identity,
+    LimitPlace,
     Node,
     ObjectPlace,
     Section,
@@ -77,9 +83,14 @@ class CanopenSection(DriveSection):
     product_code: Identity | None = None  # expected in 1018:2; none = any
     rated_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None  # compared with 6075
     rated_torque_Nm: Annotated[float, between(0.0, 10_000.0, open_low=True)] | None = None  # motor; compared with 6076
+    rated_torque_unit: Literal["mNm", "uNm"] = "mNm"  # of 6076: mNm, or µNm as maxon's EPOS4 has it
     rated_tolerance: Annotated[float, between(0.0, 0.2)] = 0.01  # of the comparisons with 6075 and 6076, relative
     torque_reference: Literal["rated_torque", "rated_current"]  # what 1000 permille of 6071 and 6077 mean
     max_torque_permille: Annotated[int, between(1, 10_000)] | None = None  # 6072; none = derived from torque_max_Nm
+    # where the drive has no 6072: the maker's own object that limits torque or current, "3001:2"; only ever lowered
+    torque_limit_object: LimitPlace | None = None
+    # what that object holds where 6071 holds 1000 permille
+    torque_limit_rated_counts: Annotated[float, between(0.0, 1e9, open_low=True)] | None = None
     velocity_unit: Literal["counts/s", "r/min", "0.1 r/min"] = "counts/s"  # of 60FF; counts of 6064, r/min of the motor
     heartbeat_s: Annotated[float, between(0.01, 2.0)]  # the drive stops itself when our heartbeat is older
     master_node: Node = 126  # whose heartbeat the drive watches
@@ -201,6 +212,7 @@ def canopen_settings(config: Config) -> CanopenSettings:
         joint_encoder=joint_encoder_settings(config),
         encoder_incremental=config.encoder.kind == "incremental",
         temperature=temperature_object(config),
+        torque_limit=torque_limit_object(config),
         **_offsets(canopen_section(config)),
     )
 
@@ -232,6 +244,14 @@ def temperature_object(config: Config) -> TemperatureObject | None:
         return None
     place = index_and_sub(drive.temperature_object)
     return TemperatureObject(*place, drive.temperature_unit_degC, drive.temperature_offset_degC)
+
+
+def torque_limit_object(config: Config) -> TorqueLimitObject | None:
+    """Which object of the maker's own limits torque or current."""
+    drive = canopen_section(config)
+    if drive.torque_limit_object is None or drive.torque_limit_rated_counts is None:
+        return None
+    return TorqueLimitObject(*index_and_sub(drive.torque_limit_object), drive.torque_limit_rated_counts)
 
 
 def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
@@ -340,6 +360,8 @@ def canopen_problems(config: Config) -> list[str]:
                     f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
                     "what drive.max_torque_permille allows"
                 )
+    if (drive.torque_limit_object is None) != (drive.torque_limit_rated_counts is None):
+        found.append("drive.torque_limit_object and drive.torque_limit_rated_counts must be given together")
     # the other one follows from the torque constant: a drive that lacks 6075 or 6076 cannot be compared with it
     reference = f"{drive.torque_reference}_{'A' if drive.torque_reference == 'rated_current' else 'Nm'}"
     if config.virtual is not None and getattr(drive, reference) is None:

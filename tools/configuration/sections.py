@@ -7,6 +7,7 @@ The comment behind a key, or above it, is its meaning: docs/configuration.md is 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Callable
@@ -337,6 +338,18 @@ def _checked(value: str) -> str:
 
 
 ObjectPlace = Annotated[str, AfterValidator(_checked)]
+
+
+def _checked_limit(value: str) -> str:
+    """No other object of CiA 402: what is written there may enable or move."""
+    with contextlib.suppress(PydanticCustomError):
+        index, sub = index_and_sub(_checked(value))
+        if index < 0x6000 or (index, sub) == (0x6073, 0):
+            return value
+    raise PydanticCustomError("object", 'must be an object of the maker, 2000 to 5FFF, such as "3001:2", or "6073"')
+
+
+LimitPlace = Annotated[str, AfterValidator(_checked_limit)]
 
 
 def index_and_sub(place: str) -> tuple[int, int]:

@@ -27,6 +27,7 @@ HISTORY = 8  # entries of 1003 that are shown
 CONSUMERS = 4  # entries of 1016
 PDO_NUMBERS = 4
 MILLI = 1e-3
+MAXON = 0xFB  # vendor of 1018:1
 
 # object, its unit as CiA 402 has it ("" = units of the drive, which its configuration decides)
 _LIMITS = (
@@ -91,9 +92,15 @@ def errors(reader: SdoReader) -> dict[str, Any]:
     }
 
 
+def rated_torque_mNm(reader: SdoReader) -> float | None:
+    """6076, which counts µNm in maxon's drives."""
+    torque = reader.value(0x6076)
+    return torque if torque is None or reader.value(0x1018, 1) != MAXON else torque * MILLI
+
+
 def ratings(reader: SdoReader) -> dict[str, Any]:
     """Rated current and torque, the torque constant that follows from them, encoder and gear."""
-    current_mA, torque_mNm = reader.value(0x6075), reader.value(0x6076)
+    current_mA, torque_mNm = reader.value(0x6075), rated_torque_mNm(reader)
     increments, turns = reader.value(0x608F, 1), reader.value(0x608F, 2)
     motor, shaft = reader.value(0x6091, 1), reader.value(0x6091, 2)
     return {

@@ -23,7 +23,7 @@ from jointctl.tools.configuration.checks import range_problems
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import section_class
 from jointctl.tools.configuration.load import echo, understood, unit_of, unit_text
-from jointctl.tools.inspection.drive_info import MILLI
+from jointctl.tools.inspection.drive_info import MAXON, MILLI, rated_torque_mNm
 from jointctl.tools.inspection.subject import SdoReader
 
 # --- A configuration that is still to be filled in: its marked lines, their values, and what each may be ---
@@ -221,7 +221,7 @@ def _identity(reader: SdoReader, folder: Path, found: FirstValues) -> None:
 
 
 def _ratings(reader: SdoReader, found: FirstValues) -> None:
-    current_mA, torque_mNm = reader.value(0x6075), reader.value(0x6076)
+    current_mA, torque_mNm = reader.value(0x6075), rated_torque_mNm(reader)
     if current_mA:
         found.known["drive", "rated_current_A"] = current_mA * MILLI, "6075"
     if torque_mNm:
@@ -232,6 +232,12 @@ def _ratings(reader: SdoReader, found: FirstValues) -> None:
     elif current_mA or torque_mNm:
         reference = "rated_current" if current_mA else "rated_torque"
         found.suggested["drive", "torque_reference"] = reference, "the only one of 6075 and 6076 that the drive has"
+    if torque_mNm and reader.value(0x1018, 1) == MAXON:
+        found.remarks.append('6076 counts µNm in a maxon drive: add rated_torque_unit = "uNm" to [drive]')
+    if reader.value(0x6072) is None:
+        found.remarks.append(
+            "no 6072 (max torque): name the maker's own limit in drive.torque_limit_object, see docs/drives"
+        )
 
 
 def _encoder(reader: SdoReader, found: FirstValues) -> None:

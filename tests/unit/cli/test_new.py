@@ -195,3 +195,16 @@ def test_every_marked_line_can_be_filled_and_checked() -> None:
 def test_an_answer_that_may_not_be_is_refused_by_name(place: tuple[str, str], text: str) -> None:
     with pytest.raises(ValueError, match=rf"{place[0]}\.{place[1]} \(={re.escape(text)}\) "):
         checked(place, text)
+
+
+@pytest.mark.parametrize("maxon", [True, False])
+def test_what_an_epos4_counts_in_and_lacks_is_said(tmp_path: Path, joint: DeviceOnBus, maxon: bool) -> None:
+    assert joint.device is not None
+    if maxon:
+        joint.answers |= {(0x1018, 1): 0xFB, (0x6076, 0): 66_500}
+        del joint.device.objects.entries[0x6072, 0]
+    with reader_of(joint) as network:
+        found = first_values(SdoReader(network, 1), tmp_path)
+    assert found.known["drive", "rated_torque_Nm"][0] == pytest.approx(0.0665 if maxon else 0.5)
+    for words in ('rated_torque_unit = "uNm"', "no 6072 (max torque): name the maker's own limit"):
+        assert any(words in remark for remark in found.remarks) is maxon

@@ -49,7 +49,7 @@ OF_THE_ENCODER = {"encoder_on_motor", "encoder_direction"}
         (
             CanopenSettings,
             CanopenSection,
-            {"eds_path", "encoder_incremental", "joint_encoder", "temperature"}
+            {"eds_path", "encoder_incremental", "joint_encoder", "temperature", "torque_limit"}
             | {"torque_offset", "velocity_offset", "velocity_share", "holds_alone"},  # of [drive.cascade]
         ),
         (ElmoSettings, ElmoSection, {"mode", "ramp_radps2"}),

@@ -18,7 +18,7 @@ from jointctl.tools.verbs.hil import with_eds
 from jointctl.tools.virtual_joint import new_device
 from tests.configurations import changed, shipped, written
 from tests.device_on_bus import DeviceOnBus
-from tests.eds_styles import EPOS4, GOLD, NANOTEC, STYLES, Listed, Style, eds_text
+from tests.eds_styles import EPOS4, EPOS4_KEYS, GOLD, NANOTEC, STYLES, U8, U16, U32, Listed, Style, eds_text
 from tests.virtual_drive import NODE, Rig
 
 NO_OBJECT, TOO_LONG = 0x06020000, 0x06070012
@@ -146,6 +146,28 @@ def test_it_moves_in_a_mode_that_it_has(tmp_path: Path) -> None:
     rig.run(200)
     assert abs(rig.speed_radps) > 1e-3
     assert abs(rig.get(0x6077)) > 0
+
+
+@pytest.mark.parametrize(("data_type", "rated_counts"), [(U8, 100.0), (U16, 500.0), (U32, 5e6)])
+@pytest.mark.parametrize("target", [199, 200, 201, -201, 900])
+def test_the_makers_own_limit_bounds_the_torque_whatever_is_commanded(
+    tmp_path: Path, data_type: int, rated_counts: float, target: int
+) -> None:
+    """200 permille; in the file its default is 0, which leaves twice the rated value."""
+    limit = Listed(0x3001, 2, data_type, "rw", "0")
+    objects = (*(each for each in EPOS4.objects if each.index != 0x3001), limit)
+    (tmp_path / "maker.eds").write_text(eds_text(dataclasses.replace(EPOS4, objects=objects)), encoding="latin-1")
+    keys = {f"drive__{key}": value for key, value in EPOS4_KEYS.items()}
+    counts = {"drive__torque_limit_rated_counts": rated_counts, "drive__node": NODE}
+    rig = Rig(device=new_device(load_config(written(tmp_path / "joint.toml", **{**keys, **counts}))))
+    assert rig.get(0x3001, 2) == 2.0 * rated_counts
+    rig.set(0x3001, 2, round(0.2 * rated_counts), {U8: 1, U16: 2, U32: 4}[data_type])
+    rig.enable(10)
+    rig.set(0x6071, 0, target, 2)
+    rig.run(2)
+    drive = rig.device.device[0].drive
+    assert abs(int(drive.demand_torque)) == min(abs(target), 200)
+    assert rig.get(0x6041) >> 11 & 1 == (abs(target) > 200)
 
 
 @pytest.mark.parametrize(
