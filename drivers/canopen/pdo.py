@@ -363,8 +363,8 @@ def _use_as_it_is(objects: ObjectAccess, pdo: PdoMap, kind: int) -> PdoMap:
 
 
 PERMILLE = 1000.0
+RATED_TORQUE_UNITS_mNm = {"mNm": 1.0, "uNm": 1e-3}  # of 6076
 # units of 60FF besides the encoder's counts per second: motor speed [rad/s] of one unit
-RATED_TORQUE_UNITS_mNm = {"mNm": 1.0, "uNm": 1e-3}
 VELOCITY_UNITS = {"counts/s": None, "r/min": math.tau / 60.0, "0.1 r/min": math.tau / 600.0}
 
 

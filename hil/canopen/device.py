@@ -49,9 +49,7 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
-    torque_limit: tuple[int, int, float] | None = (
-        None  # the maker's own limit: index, sub, what it holds at rated torque
-    )
+    torque_limit: tuple[int, int, float] | None = None  # the maker's own: index, sub, what it holds at rated torque
     shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
 
     def __post_init__(self) -> None:
