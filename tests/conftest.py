@@ -26,6 +26,7 @@ from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.virtual_joint import new_device
+from tests import plain_records
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS, ROOT
@@ -57,6 +58,8 @@ def pytest_configure() -> None:
     for name in ("COLUMNS", "LINES"):  # readline gives them to processes that a test process starts
         os.environ.pop(name, None)
     gc.set_threshold(50_000, 20, 10)  # a tenth of the time of tests went into it
+    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+        plain_records.use()
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 
 

@@ -9,12 +9,15 @@ Not modelled by the bus: acknowledge, error frames, bit errors, bus-off.  Not su
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import os
 import re
 import select
 import socket
 import stat
+import struct
 import time
 from pathlib import Path
 from typing import Any
@@ -111,11 +114,35 @@ def decode(datagram: bytes, timestamp_s: float, channel: str) -> can.Message | N
     )
 
 
+# --- Frames that nobody wants are dropped by the system (Linux, Documentation/networking/filter.rst) ---
+# It asks a socket's filter when a frame is sent to it: what the filter drops wakes nobody up.
+
+
+_SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27
+_LOAD, _AND, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x54, 0x15, 0x06  # classic BPF; _LOAD takes four bytes, the highest first
+_WHOLE_FRAME, _NOTHING = 0xFFFFFFFF, 0
+_STEP_BYTES = 8
+
+
+def _filter_program(filters: can.typechecking.CanFilters) -> bytes:
+    """`struct sock_filter[]` that lets through what one of the filters matches, as python-can understands them."""
+    program = []
+    for wanted in filters:
+        mask, identifier = wanted["can_mask"] & _EXTENDED_MASK, wanted["can_id"]
+        if "extended" in wanted:
+            mask |= EXTENDED_FLAG
+            identifier = identifier & _EXTENDED_MASK | (EXTENDED_FLAG if wanted["extended"] else 0)
+        in_frame = [int.from_bytes(struct.pack("=I", word)) for word in (mask, identifier & mask)]
+        program += [(_LOAD, 0, 0, 0), (_AND, 0, 0, in_frame[0]), (_JUMP_IF_EQUAL, 0, 1, in_frame[1])]
+        program += [(_RETURN, 0, 0, _WHOLE_FRAME)]
+    return b"".join(struct.pack("=HBBI", *step) for step in [*program, (_RETURN, 0, 0, _NOTHING)])
+
+
 class VirtualBus(can.BusABC):
     """python-can interface "jointctl".  `channel` is the name of a bus, or the path of its socket.
 
     The time stamp of a message is the wall clock at its reception by this process, not by the bus.  `bitrate` is
-    accepted and ignored, as it belongs to the bus.  Filters are applied in this process.
+    accepted and ignored, as it belongs to the bus.
     """
 
     def __init__(
@@ -172,6 +199,17 @@ class VirtualBus(can.BusABC):
                 self._wait(select.POLLOUT, remaining_s)
             except OSError as error:
                 raise can.CanOperationError(f"virtual bus {self._channel}: {error.strerror or error}") from error
+
+    def _apply_filters(self, filters: can.typechecking.CanFilters | None) -> None:
+        """In the system; `recv` asks them again, as frames may have come before, and the system takes only so many."""
+        with contextlib.suppress(OSError):  # there was none
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+        if filters:
+            program = _filter_program(filters)
+            steps = ctypes.create_string_buffer(program, len(program))
+            whole = struct.pack("@HP", len(program) // _STEP_BYTES, ctypes.addressof(steps))  # struct sock_fprog
+            with contextlib.suppress(OSError, struct.error):
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, whole)
 
     def _wait(self, events: int, seconds_s: float | None) -> None:
         poll = select.poll()  # select() fails on descriptors above 1023

@@ -19,7 +19,7 @@ from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, com
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder import EncoderEnd
 from jointctl.drivers.canopen.identifiers import NmtCommand
-from jointctl.drivers.canopen.network import OtherControllers, new_network, report_own_frames
+from jointctl.drivers.canopen.network import OtherControllers, new_network, receive_beside_loop, report_own_frames
 from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, new_port, start_position_rad
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
@@ -308,6 +308,7 @@ class CanopenDrive:
                 self._others.refuse()
                 self._gate()
             else:
+                receive_beside_loop(self._network, self._others.nodes)
                 self._guard = WatchdogGuard(
                     self._objects, self._reads, self._settings.node, self._findings.mode, self._others.refuse
                 )

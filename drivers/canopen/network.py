@@ -15,12 +15,15 @@ from typing import Any
 import can
 import canopen
 
+from jointctl.drivers.can.open import receive_only
 from jointctl.drivers.canopen.identifiers import (
+    EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,
     NMT_ID,
     NODE_MASK,
     RPDO_IDS,
+    SDO_ANSWER_ID,
     SDO_REQUEST_ID,
     SYNC_ID,
     TPDO_IDS,
@@ -154,6 +157,11 @@ class OtherControllers(can.Listener):
             return None
         return int.from_bytes(data[1:3], "little")
 
+    @property
+    def nodes(self) -> frozenset[int]:
+        """The drives and encoders of this program."""
+        return self._nodes
+
     def own_loop_begins(self) -> None:
         """SYNC, RPDOs and heartbeats may be our own from here on, and reading an object disturbs no one."""
         with self._lock:
@@ -199,6 +207,15 @@ def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can
     added: list[Any] = [BusFailure(sleep), *listeners]  # the library knows only its own kind of listener
     network.listeners.extend(added)
     return network
+
+
+def receive_beside_loop(network: canopen.Network, nodes: Iterable[int]) -> None:
+    """No SYNC and no PDO any more: thousands a second, which say nothing to this end while a loop runs."""
+    assert network.bus is not None
+    wanted = [(NMT_ID, FUNCTION_MASK | NODE_MASK)]
+    wanted += [(base, FUNCTION_MASK) for base in (SDO_ANSWER_ID, SDO_REQUEST_ID, HEARTBEAT_ID)]
+    wanted += [(EMERGENCY_ID + node, FUNCTION_MASK | NODE_MASK) for node in nodes]
+    receive_only(network.bus, wanted)
 
 
 def send_nmt(network: canopen.Network, command: NmtCommand, node: int) -> None:

@@ -12,6 +12,7 @@ import pytest
 from jointctl.firmware_py import records
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import array_of, dtype_of, f8, i1, i2, i4, i8, new, record, u1, u2, u4, view
+from tests import plain_records
 
 
 @record
@@ -125,3 +126,31 @@ def test_a_log_record_has_no_holes_before_its_end() -> None:
         assert offset == at
         at += field.itemsize
     assert dtype.itemsize - at < 8
+
+
+@pytest.mark.parametrize("cls", [Outer, records.AxisState, records.AxisConstants], ids=lambda cls: cls.__name__)
+def test_the_fields_of_plain_records_are_numpys(cls: type) -> None:
+    """What `tests.plain_records` puts in numpy's place: the same values and memory, parts of parts, and errors."""
+    array = new(cls)
+    array.view(np.uint8)[:] = np.arange(array.nbytes) % 64
+
+    def compare(whole: np.record) -> None:
+        assert whole.dtype.names is not None
+        for name in whole.dtype.names:
+            own, numpys = plain_records.attribute(whole, name), getattr(whole, name)
+            assert type(own) is type(numpys)
+            np.testing.assert_array_equal(own, numpys)
+            if isinstance(own, np.record):
+                assert own.dtype == numpys.dtype
+                compare(own)
+            elif isinstance(own, np.ndarray):
+                assert np.shares_memory(own, numpys)
+            else:
+                plain_records.set_attribute(whole, name, 5)
+                assert getattr(whole, name) == plain_records.attribute(whole, name) == 5
+
+    compare(array[0])
+    for attribute in (plain_records.attribute, lambda whole, name: plain_records.set_attribute(whole, name, 1)):
+        with pytest.raises(AttributeError):
+            attribute(array[0], "not_there")
+    assert plain_records.attribute(array[0], "dtype") is array[0].dtype

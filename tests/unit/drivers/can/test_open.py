@@ -340,6 +340,45 @@ def test_filters(buses: tuple[VirtualBus, VirtualBus]) -> None:
     assert buses[1].recv(0.02) is None
 
 
+FILTERS = st.fixed_dictionaries(
+    {"can_id": st.sampled_from([0, 0x80, 0x81, 0x180, 2**29 - 1]), "can_mask": st.sampled_from([0, 0x780, 2**32 - 1])},
+    optional={"extended": st.booleans()},
+)
+LAST = {"can_id": 0x1ABCDEF, "can_mask": 2**29 - 1, "extended": True}
+
+
+@given(filters=st.lists(FILTERS, max_size=4))
+def test_the_system_drops_what_python_can_would(buses: tuple[VirtualBus, VirtualBus], filters: list[Any]) -> None:
+    """A program whose frames are dropped there is not woken up."""
+    sender, bus = buses
+    bus.set_filters([*filters, LAST])
+    frames = [
+        can.Message(arbitration_id=identifier, is_extended_id=extended, is_remote_frame=remote)
+        for identifier in (0, 0x80, 0x81, 0x1FF, 0x7FF)
+        for extended in (False, True)
+        for remote in (False, True)
+    ]
+    frames.append(can.Message(arbitration_id=LAST["can_id"]))
+    wanted = [frame for frame in frames if bus._matches_filters(frame)]
+    bus._filters = None  # from here on only the system's own
+    for frame in frames:
+        sender.send(frame)
+    for frame in wanted:
+        message = bus.recv(10.0)
+        assert message is not None
+        assert message.equals(frame, timestamp_delta=None, check_channel=False, check_direction=False)
+
+
+def test_more_filters_than_the_system_takes_are_python_cans(buses: tuple[VirtualBus, VirtualBus]) -> None:
+    buses[1].set_filters([LAST])
+    buses[1].set_filters([{"can_id": 0x180, "can_mask": 0x7FF, "extended": False}] * 2000)
+    for identifier in (0x17F, 0x180):
+        buses[0].send(can.Message(arbitration_id=identifier, is_extended_id=False))
+    message = buses[1].recv(10.0)
+    assert message is not None
+    assert message.arbitration_id == 0x180
+
+
 def test_the_notifier_waits_on_the_descriptor(buses: tuple[VirtualBus, VirtualBus]) -> None:
     reader = can.BufferedReader()
     notifier = can.Notifier(buses[1], [reader], timeout=0.05)

@@ -14,7 +14,7 @@ from typing import Any, cast
 import can
 import pytest
 
-from jointctl.drivers.canopen import commissioning
+from jointctl.drivers.canopen import commissioning, network
 from jointctl.drivers.canopen.cia402 import ControlWord, Mode, State
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_S, STEEP_RADPS2, wait_until_ready
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
@@ -561,6 +561,16 @@ def test_a_stop_at_the_last_moment_keeps_the_drive_from_being_started(joint: Any
     with pytest.raises(Stop):
         drive.start_cyclic()
     assert (0, bytes([NmtCommand.START, 1])) not in joint.requests
+
+
+def test_the_frames_of_the_loop_are_not_received_from_its_start_on(joint: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[tuple[int, int]]] = []
+    monkeypatch.setattr(network, "receive_only", lambda _, wanted: asked.append(wanted))
+    with joint.opened() as drive:
+        drive.commission()
+        assert not asked
+        drive.start_cyclic()
+    assert [(0x081, 0x7FF) in wanted for wanted in asked] == [True]
 
 
 @pytest.mark.parametrize("started", [True, False])

@@ -8,9 +8,18 @@ import can
 import pytest
 
 from jointctl.drivers.can import open as open_module
+from jointctl.drivers.can.virtual_bus import VirtualBus
 from jointctl.drivers.canopen.drive import CanopenDrive
-from jointctl.drivers.canopen.network import FAILURE_PAUSE_S, LISTEN_S, BusFailure, OtherControllers
+from jointctl.drivers.canopen.network import (
+    FAILURE_PAUSE_S,
+    LISTEN_S,
+    BusFailure,
+    OtherControllers,
+    new_network,
+    receive_beside_loop,
+)
 from jointctl.drivers.errors import BusError
+from jointctl.hil.virtual_bus import VirtualBusHub
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config, moved
 from jointctl.tools.session.canopen_drive import CanopenSession
@@ -170,6 +179,24 @@ def test_on_a_bus_of_its_own_it_waits_for_nothing_and_still_hears_another() -> N
     others.on_message_received(can.Message(arbitration_id=0x080, is_extended_id=False))
     with pytest.raises(BusError, match="another controller is active on this bus: 1 x SYNC"):
         others.refuse()
+
+
+def test_beside_our_own_loop_no_sync_and_no_pdo_is_handed_over(tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("b") / "bus.sock"
+    heard = can.BufferedReader()
+    with VirtualBusHub(path), VirtualBus(str(path)) as other:
+        network = new_network(VirtualBus(str(path)), lambda _: None, heard)
+        network.connect()
+        receive_beside_loop(network, [NODE, 9])
+        for identifier in [*range(0x800), 0]:
+            other.send(can.Message(arbitration_id=identifier, is_extended_id=False), timeout=10.0)
+        came: list[int] = []
+        while came.count(0) < 2:
+            message = heard.get_message(10.0)
+            assert message is not None
+            came.append(message.arbitration_id)
+        network.disconnect()
+    assert came == [0, 0x080 + NODE, 0x080 + 9, *range(0x580, 0x680), *range(0x700, 0x780), 0]
 
 
 @pytest.mark.parametrize(("interface", "waits_s"), [("jointctl", 0.0), ("socketcan", LISTEN_S), ("virtual", LISTEN_S)])
