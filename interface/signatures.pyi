@@ -28,7 +28,7 @@ def run(
     dry_run: bool = False,
     allow_low_margin: bool = False,
     scope: bool = False,
-    scope_host: str = '127.0.0.1',
+    scope_host: str = "127.0.0.1",
     scope_port: int = 8642,
     foxglove: str | None = None,
     ros2: int | None = None,
@@ -37,7 +37,6 @@ def run(
     hold: bool = False,
     quiet: bool = False,
 ) -> RunResult | None: ...
-
 def check(
     config: str | Path,
     *,
@@ -46,7 +45,6 @@ def check(
     allow_low_margin: bool = False,
     choose_gains: bool = False,
 ) -> LoopCheck: ...
-
 def sweep(
     config: str | Path,
     *,
@@ -57,7 +55,7 @@ def sweep(
     target: int | None = None,
     port: str | None = None,
     points: int | None = None,
-    grid: str = 'near-zero',
+    grid: str = "near-zero",
     speeds: str | Path | None = None,
     max_speed_radps: float | None = None,
     min_speed_radps: float | None = None,
@@ -69,7 +67,7 @@ def sweep(
     places_rad: list[float] | None = None,
     warm_between_turns: float = 0.0,
     dwell_s: float | None = None,
-    mode: str = 'auto',
+    mode: str = "auto",
     resume: bool = False,
     dry_run: bool = False,
     yes: bool = False,
@@ -81,7 +79,6 @@ def sweep(
     ros2_listen: str | None = None,
     quiet: bool = False,
 ) -> SweepResult | None: ...
-
 def excite(
     config: str | Path,
     *,
@@ -99,7 +96,6 @@ def excite(
     allow_low_margin: bool = False,
     quiet: bool = False,
 ) -> ExciteResult | None: ...
-
 def response(
     config: str | Path,
     *,
@@ -118,7 +114,6 @@ def response(
     allow_low_margin: bool = False,
     quiet: bool = False,
 ) -> tuple[FrequencyResponse, JointFit] | None: ...
-
 def map(
     config: str | Path,
     *,
@@ -137,7 +132,6 @@ def map(
     allow_low_margin: bool = False,
     quiet: bool = False,
 ) -> FoundMap | None: ...
-
 def tune(
     config: str | Path,
     *,
@@ -146,8 +140,8 @@ def tune(
     bitrate: int | None = None,
     target: int | None = None,
     port: str | None = None,
-    law: str = 'auto',
-    objective: str = 'tracking',
+    law: str = "auto",
+    objective: str = "tracking",
     torque_Nm: float | None = None,
     refine: bool = False,
     resume: bool = False,
@@ -157,15 +151,13 @@ def tune(
     dry_run: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any] | None: ...
-
 def demo(
     *,
-    config: str | Path = 'virtual',
+    config: str | Path = "virtual",
     arm: bool = False,
     duration_s: float | None = None,
     quiet: bool = False,
 ) -> RunResult: ...
-
 def validate(
     path: str | Path,
     data_path: str | Path,
@@ -177,16 +169,16 @@ def validate(
     velocity_unit: str | None = None,
     side: str | None = None,
     torque_side: str | None = None,
-    torque_unit: str = 'Nm',
-    current_unit: str = 'A',
+    torque_unit: str = "Nm",
+    current_unit: str = "A",
     ratio: float | None = None,
     torque_constant_NmpA: float | None = None,
     counts_per_turn: float | None = None,
     reverse: list[str] | None = None,
     where: list[str] | None = None,
-    delimiter: str = 'auto',
+    delimiter: str = "auto",
     time_column: str | None = None,
-    time_unit: str = 's',
+    time_unit: str = "s",
     sample_rate_Hz: float | None = None,
     motion_column: str | None = None,
     position_column: str | None = None,
@@ -194,16 +186,14 @@ def validate(
     position_side: str | None = None,
     load_column: str | None = None,
     temperature_column: str | None = None,
-    temperature_unit: str = 'degC',
+    temperature_unit: str = "degC",
     quiet: bool = False,
 ) -> Validation: ...
-
 def report(
     paths: list[str | Path],
     *,
     out: str | Path | None = None,
 ) -> Path: ...
-
 def study(
     *,
     file: str | Path | None = None,
@@ -221,7 +211,6 @@ def study(
     report: str | Path | None = None,
     quiet: bool = False,
 ) -> StudyResult: ...
-
 def paper(
     *,
     folder: str | Path | None = None,
@@ -229,9 +218,8 @@ def paper(
     report: str | Path | None = None,
     quiet: bool = False,
 ) -> PaperResult: ...
-
 def fault_campaign(
-    config: str | Path = 'virtual',
+    config: str | Path = "virtual",
     *,
     count: int = 10000,
     seed: int = 1,
@@ -239,16 +227,15 @@ def fault_campaign(
     sweep: bool = False,
     program: bool = False,
     tune: bool = False,
-    folder: str | Path = 'fault-campaign',
+    folder: str | Path = "fault-campaign",
     workers: int | None = None,
     cluster: str | None = None,
     cluster_unprotected: bool = False,
     report: str | Path | None = None,
     quiet: bool = False,
 ) -> list[Verdict]: ...
-
 def doctor(
-    config: str | Path = 'virtual',
+    config: str | Path = "virtual",
     *,
     interface: str | None = None,
     channel: str | None = None,
@@ -261,7 +248,6 @@ def doctor(
     yes: bool = False,
     quiet: bool = False,
 ) -> list[Finding]: ...
-
 def scan(
     config: str | Path | None = None,
     *,
@@ -273,7 +259,6 @@ def scan(
     passive: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]: ...
-
 def info(
     config: str | Path | None = None,
     *,
@@ -285,7 +270,6 @@ def info(
     eds: str | Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]: ...
-
 def stop(
     config: str | Path,
     *,
@@ -295,7 +279,6 @@ def stop(
     target: int | None = None,
     port: str | None = None,
 ) -> str: ...
-
 def clear_fault(
     config: str | Path,
     *,
@@ -305,7 +288,6 @@ def clear_fault(
     target: int | None = None,
     port: str | None = None,
 ) -> str: ...
-
 def zero(
     config: str | Path,
     *,
@@ -318,11 +300,10 @@ def zero(
     yes: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]: ...
-
 def new(
     path: str | Path,
     *,
-    shipped: str = 'elmo_gold_can',
+    shipped: str = "elmo_gold_can",
     interface: str | None = None,
     channel: str | None = None,
     bitrate: int | None = None,
@@ -330,6 +311,6 @@ def new(
     no_input: bool = False,
     arm: bool = False,
     urdf: str | Path | None = None,
-    joints: str = '',
+    joints: str = "",
     quiet: bool = False,
 ) -> None: ...
