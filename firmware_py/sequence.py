@@ -50,6 +50,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.still_cycles = 0
     state.frozen_samples = 0
     state.pushed_cycles = 0
+    state.pushed_max_cycles = 0
     state.second_position_rad = 0.0
     state.table_row = 0
     state.trajectory_s = 0.0

@@ -109,6 +109,7 @@ def test_a_fault_is_that_of_its_joint_and_its_twin_is_none(
     [
         (20261126, 8579, Fault.FOLLOWING_ERROR),  # the shoulder's encoder is reversed: it throws the wrist
         (1, 8936, Fault.FOLLOWING_ERROR),  # the shoulder swings behind late samples, and shakes the elbow
+        (880077123, 194, Fault.FOLLOWING_ERROR),  # the same, at a third of its following error
     ],
 )
 def test_a_joint_that_is_thrown_by_another_one_is_not_called_frozen(

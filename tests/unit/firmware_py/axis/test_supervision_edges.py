@@ -258,11 +258,13 @@ def test_of_an_arm_what_the_other_joints_ask_for_pushes_none(
 
 @pytest.mark.parametrize("shaken", [0, 1])
 def test_beside_a_joint_that_is_astray_a_push_must_last_longer(stuck: tuple[Any, Any], shaken: int) -> None:
+    """It counts what was when the push began: a joint that is pushed unseen drives others astray."""
     axis, state = stuck
     state.command_torque_Nm, state.shaken = 4.0, shaken
     longest = SHAKEN_CYCLES if shaken else PUSHED_CYCLES
     for _ in range(longest):
         check_reading(axis, state, 1)
+        state.shaken = 1 - shaken
     assert (state.pushed_cycles, state.fault) == (longest, Fault.NONE)
     check_reading(axis, state, 1)
     assert state.fault == Fault.POSITION_FROZEN
@@ -285,6 +287,8 @@ def test_a_joint_under_torque_far_from_its_reference_is_astray(
     state.measured_position_rad = 0.3 + share * ASTRAY_SHARE * axis.limits.following_error_max_rad
     under_torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
     assert is_astray(axis.limits, state) == (astray if under_torque else 0)
+    state.saturated_cycles = 1
+    assert is_astray(axis.limits, state) == int(under_torque)
 
 
 @pytest.mark.parametrize("by", ["less torque", "a reading that moves"])
