@@ -28,6 +28,7 @@ from jointctl.firmware_py.safety import (
     check_motion,
     check_reading,
     check_reference,
+    check_release,
     check_saturation,
     check_stop_time,
     check_supervision,
@@ -360,6 +361,7 @@ def move_axis(
     if powered(state.phase):
         check_reading(constants, state, elapsed_cycles)
         check_motion(constants, state)
+        check_release(constants, state)
 
 
 @kernel

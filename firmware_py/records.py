@@ -501,6 +501,8 @@ class AxisState:
     held_up_cycles: i8  # of them those that the loop skipped in overruns beyond skipped_max_cycles
     ready: i4  # to go on to the next phase, as far as this axis is concerned
     held_back: i4  # by another axis that is not; set before the cycle, 0 for a single joint
+    shaken: i4  # 1 while another axis is astray; set before the cycle, 0 for a single joint
+    stood_rad: f8  # when its drive was enabled, from then on without torque, or when its torque began to be released
     good_samples: i8
     sample_count: i8
     gap_cycles: i8  # periods since the sample before this cycle's, 0 where there is no new one
@@ -509,6 +511,7 @@ class AxisState:
     still_cycles: i8
     frozen_samples: i8  # in a row, without a gap, that did not change
     pushed_cycles: i8  # of them with more torque than frozen_torque_Nm
+    pushed_max_cycles: i8  # that are allowed, since it began
     frozen_way_rad: f8  # how far the reference has moved since the reading last changed
     frozen_reference_rad: f8  # where the reference was when that was last looked at
     frozen_at_rad: f8  # that reading

@@ -43,6 +43,9 @@ ROUNDING_rad = 1e-12  # of a desired position: a motion that ends at a limit is 
 LOOK_AHEAD_rad = 1e-5  # at most so much is allowed for the jerk of a desired motion that comes to rest at a limit
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 PUSHED_CYCLES = 20  # at a torque that a healthy joint gives way to: it moves by a milliradian in that time
+SHAKEN_CYCLES = 100  # the same, if another joint of the arm was astray when it began, and may be what pushes back
+ASTRAY_SHARE = 0.5  # of following_error_max_rad: what such a joint does to the others is not what the model knows
+SINKS_SHARE = 0.25  # of following_error_max_rad: a joint without torque that has moved farther is not held by friction
 
 # one bit for the code of each fault with that reaction
 POWER_OFF_FAULTS = sum(1 << fault for fault in Fault if fault.reaction is Reaction.OFF)
@@ -343,7 +346,8 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     following error is too large.  A joint that has slid ahead of its reference stands until it is behind it again: of
     the way that the reference has gone, as much as it is behind is held against the reading, and what is beyond
     `frozen_ahead_rad` in any case.  Where the drive closes a loop itself, the torque is the one that it measures; in an
-    arm it is what the command has beyond the arm's own.
+    arm it is what the command has beyond the arm's own.  A joint that is astray throws the others, which stand still
+    against that: it is to be the first that is reported.  One that goes astray only after the push does not count.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
@@ -367,11 +371,23 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
         if 0.0 < limits.frozen_max_rad < held_against_rad:
             trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
+            if state.pushed_cycles == 0:
+                state.pushed_max_cycles = SHAKEN_CYCLES if state.shaken != 0 else PUSHED_CYCLES
             state.pushed_cycles += 1
-            if state.pushed_cycles > PUSHED_CYCLES:
+            if state.pushed_cycles > state.pushed_max_cycles:
                 trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         else:
             state.pushed_cycles = 0
+
+
+@kernel
+def is_astray(limits: LimitConstants, state: AxisState) -> int:
+    """1 for a joint under torque at its torque limit, or far from its reference, or whose error is no number."""
+    if not powered(state.phase):
+        return 0
+    error_rad = state.measured_position_rad - state.reference.position_rad
+    near = abs(error_rad) <= ASTRAY_SHARE * limits.following_error_max_rad
+    return 0 if near and state.saturated_cycles == 0 else 1
 
 
 @kernel
@@ -409,6 +425,27 @@ def check_motion(constants: AxisConstants, state: AxisState) -> None:
     elif fault == Fault.FOLLOWING_ERROR:
         value = error_rad
     trip(state, fault, value, 0)
+
+
+@kernel
+def sinks(limits: LimitConstants, state: AxisState) -> bool:
+    """Whether a joint that no torque holds has left the place where it stood when that began."""
+    return not abs(state.measured_position_rad - state.stood_rad) <= SINKS_SHARE * limits.following_error_max_rad
+
+
+@kernel
+def check_release(constants: AxisConstants, state: AxisState) -> None:
+    """RELEASING: a joint that friction does not hold is braked by its drive before the power goes off.
+
+    It is no fault, since it was stopped on purpose and did stand; the limits of the motion hold as before.
+    """
+    if state.phase != AxisPhase.RELEASING:
+        return
+    if state.phase_cycle == 0:
+        state.stood_rad = state.measured_position_rad
+    elif sinks(constants.limits, state):
+        state.notices |= Notice.SANK
+        react(state, Reaction.QUICK_STOP)
 
 
 # --- 5. The command: finite, limit, rate limit, in that order ---

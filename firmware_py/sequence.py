@@ -41,6 +41,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.good_samples = 0
     state.ready = 0
     state.held_back = 0
+    state.shaken = 0
+    state.stood_rad = 0.0
     state.sample_count = 0
     state.sample_age_cycles = 0
     state.gap_cycles = 0
@@ -48,6 +50,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.still_cycles = 0
     state.frozen_samples = 0
     state.pushed_cycles = 0
+    state.pushed_max_cycles = 0
     state.second_position_rad = 0.0
     state.table_row = 0
     state.trajectory_s = 0.0
@@ -156,6 +159,8 @@ def step_enabling(
 
     A joint of an arm waits until `all_prepared`, then until `all_enabled`; one that never is ends the run of all.
     """
+    if sample.drive_state != DriveState.ENABLED:
+        state.stood_rad = state.measured_position_rad
     if is_enabled(state, sample):
         if moved_before_start(constants, state) or not all_enabled:  # a brake that has opened, say
             return

@@ -12,7 +12,8 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.drivers.errors import ConfigurationError, UsageError
-from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.safety import SINKS_SHARE
+from jointctl.firmware_py.states import AxisPhase, Fault, Notice
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
@@ -101,6 +102,48 @@ def test_a_fault_is_that_of_its_joint_and_its_twin_is_none(
     assert max(begun) - min(begun) <= 1
     twin, _ = run_arm_scenario(joints, of_kind(arm, kind, axis, harmless=True))
     assert [run.fault for run in twin] == [Fault.NONE] * 3
+
+
+@pytest.mark.parametrize(
+    ("seed", "number", "fault"),
+    [
+        (20261126, 8579, Fault.FOLLOWING_ERROR),  # the shoulder's encoder is reversed: it throws the wrist
+        (1, 8936, Fault.FOLLOWING_ERROR),  # the shoulder swings behind late samples, and shakes the elbow
+        (880077123, 194, Fault.FOLLOWING_ERROR),  # the same, at a third of its following error
+    ],
+)
+def test_a_joint_that_is_thrown_by_another_one_is_not_called_frozen(
+    arm: ArmConfig, joints: LockstepArm, masses: Masses, seed: int, number: int, fault: Fault
+) -> None:
+    scenario = draw_arm_scenario(arm, seed, number)
+    verdict = judge_arm(joints, masses, scenario)
+    assert (verdict.violations, verdict.fault) == ((), fault.name)
+
+
+def test_a_joint_sinks_by_little_while_it_waits_for_another_ones_drive(
+    arm: ArmConfig, joints: LockstepArm, masses: Masses
+) -> None:
+    """The elbow's drive takes no RPDO any more, when the shoulder's brake has opened and gravity pulls at it."""
+    scenario = draw_arm_scenario(arm, 31, 325)
+    runs, constants = run_arm_scenario(joints, scenario)
+    assert [run.fault for run in runs][:2] == [Fault.NONE, Fault.ENABLE_TIMEOUT]
+    moved = np.abs(runs[0].truth[:, TRUE_POSITION_rad] - runs[0].truth[0, TRUE_POSITION_rad]).max()
+    assert SINKS_SHARE < moved / constants[0].limits.following_error_max_rad < 2.0 * SINKS_SHARE
+    assert judge_arm(joints, masses, scenario).violations == ()
+
+
+def test_a_joint_that_friction_does_not_hold_sinks_by_little_when_its_torque_is_released(
+    arm: ArmConfig, joints: LockstepArm, masses: Masses
+) -> None:
+    """27 Nm of gravity, 16 Nm of friction, and the brake closes only when the power goes off."""
+    scenario = draw_arm_scenario(arm, 31, 1219)
+    runs, constants = run_arm_scenario(joints, scenario)
+    assert [run.fault for run in runs] == [Fault.NONE] * 3
+    assert [int(run.state.notices) & Notice.SANK for run in runs] == [Notice.SANK, 0, 0]
+    row = int(np.flatnonzero(runs[0].log.phase == AxisPhase.RELEASING)[0])
+    position = runs[0].truth[row:, TRUE_POSITION_rad]
+    assert np.ptp(position) < 2.0 * SINKS_SHARE * constants[0].limits.following_error_max_rad
+    assert judge_arm(joints, masses, scenario).violations == ()
 
 
 def test_what_is_the_computers_reaches_every_drive(arm: ArmConfig, joints: LockstepArm) -> None:

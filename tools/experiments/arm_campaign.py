@@ -378,10 +378,6 @@ def _wrong_report(
     else:
         return [f"the fault is reported as that of {names[earliest[0]]}, {runs[earliest[0]].fault.name}"]
     found = [f"{names[reported]}: {line}" for line in wrong_cause(runs[reported], fault, period_ns * 1e-9, start_ns)]
-    if fault.harmless and fault.kind is FaultKind.LOAD_JUMP and first >= 0:
-        log = runs[reported].log
-        if log.phase[log.fault == Fault.NONE][-1] == AxisPhase.RELEASING:  # friction need not hold it beside gravity
-            return []
     if fault.harmless:
         return found or [f"{names[axis]}: a harmless fault of {names[faulty]} tripped {run.fault.name}"
                          for axis, run in enumerate(runs) if run.fault is not Fault.NONE]  # fmt: skip

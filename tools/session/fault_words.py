@@ -180,7 +180,8 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
     ),
     Fault.ENABLE_TIMEOUT: FaultWords(
         "the drive did not reach Operation Enabled in time (statusword {word})",
-        "no motor supply, STO open, or an interlock of the drive",
+        "no motor supply, STO open, an interlock of the drive, or, in an arm, a drive that is so much later than the "
+        "others that one of their joints sank, enabled and not yet under torque",
         "check voltage and STO; the statusword's bit 4 is the motor supply",
     ),
     Fault.SUPERVISOR_LOST: FaultWords(
@@ -361,6 +362,13 @@ def notice_text(notice: Notice, state: AxisState) -> str:
             f"torque noise: the command changes by {float(state.swing.noise_told_Nm):.1f} Nm from cycle to cycle; "
             'an encoder with more counts, control.velocity_filter = "kalman", a lower control.velocity_cutoff_Hz or '
             "lower gains (kv, observer_radps) make it quieter"
+        )
+    if notice is Notice.SANK:
+        moved_rad = float(state.measured_position_rad - state.stood_rad)
+        return (
+            f"the joint moved by {moved_rad:.4f} rad while its torque was released, as under a load that friction does "
+            "not hold, and the drive braked it: with the power off nothing but a brake holds it there; "
+            "without one, support it, or let the motion end where the load is less"
         )
     return (
         "iterative learning is off for the rest of the run: its error grew in three repetitions, to "

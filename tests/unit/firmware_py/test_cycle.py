@@ -27,6 +27,7 @@ from jointctl.firmware_py.cycle import (
     step_cycle,
 )
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.safety import ASTRAY_SHARE, SINKS_SHARE
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
@@ -63,9 +64,12 @@ class Arm:
         self.slow_to_prepare = [0, 0]  # cycles until each drive obeys
         self.slow_to_enable = [0, 0]
         self.moving_rad = [0.0, 0.0]  # in each cycle
+        self.silent = [False, False]
 
     def _receive(self, _: None, samples: Any, now_ns: int, until_ns: int) -> int:
         for axis, (sample, command) in enumerate(zip(samples, self.memory.command, strict=True)):
+            if self.silent[axis]:
+                continue
             sample.count += 1
             sample.time_ns = now_ns + 1500
             sample.position_rad += self.moving_rad[axis]
@@ -196,6 +200,80 @@ def test_a_drive_that_never_enables_keeps_the_torque_from_the_other(slow: int, s
     assert arm.faults[1 - slow] == Fault.NONE
     assert torques == 0.0
     assert not phases & {AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING}
+
+
+def sinking(late: int, share: float) -> Arm:
+    """The drive of `late` does not enable; the other joint has moved by `share` of what a joint may sink by."""
+    arm = Arm()
+    arm.slow_to_enable[late] = 1 << 30
+    while arm.memory.sample.drive_state[1 - late] != DriveState.ENABLED:
+        arm.run(1)
+    arm.run(5)
+    arm.memory.sample[1 - late].position_rad += share * SINKS_SHARE * arm.constants[0].limits.following_error_max_rad
+    return arm
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("share", [1.001, -1.001])
+def test_an_enabled_joint_that_sinks_is_laid_to_the_drive_that_it_waits_for(late: int, share: float) -> None:
+    """All are off in the same cycle."""
+    arm = sinking(late, share)
+    for axis in range(2):
+        arm.constants[axis].limits.position_jump_max_rad = 1.0
+    arm.run(1)
+    assert arm.faults == [Fault.ENABLE_TIMEOUT if axis == late else Fault.NONE for axis in range(2)]
+    assert list(arm.memory.command.request) == [DriveRequest.OFF] * 2
+    assert list(arm.memory.command.torque_Nm) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("share", [0.999, -0.999])
+def test_its_twin_that_sags_a_little_waits_and_begins_with_the_other(late: int, share: float) -> None:
+    arm = sinking(late, share)
+    for axis in range(2):
+        arm.constants[axis].limits.position_jump_max_rad = 1.0
+    arm.run(3)
+    assert (arm.phases, arm.faults) == ([AxisPhase.ENABLING] * 2, [Fault.NONE] * 2)
+    arm.slow_to_enable[late] = 0
+    arm.run(3)
+    assert (arm.phases, arm.faults) == ([AxisPhase.APPROACH] * 2, [Fault.NONE] * 2)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize(
+    ("enabled", "silent_cycles", "fault"),
+    [
+        (False, 2, Fault.ENABLE_TIMEOUT),
+        (False, 3, Fault.STALE_SAMPLE),
+        (True, 2, Fault.NONE),
+        (True, 3, Fault.STALE_SAMPLE),
+    ],
+)
+def test_a_joint_that_is_waited_for_since_its_samples_stay_away_is_named_for_that(
+    late: int, enabled: bool, silent_cycles: int, fault: Fault
+) -> None:
+    """A drive that was enabled when it was last heard may be so still."""
+    arm = sinking(late, 0.0)
+    for axis in range(2):
+        arm.constants[axis].limits.position_jump_max_rad = 1.0
+    if enabled:
+        arm.memory.sample[late].drive_state = DriveState.ENABLED
+    arm.silent[late] = True
+    arm.run(silent_cycles - 1)
+    arm.memory.sample[1 - late].position_rad += 0.1
+    arm.run(1)
+    assert arm.faults == [fault if axis == late else Fault.NONE for axis in range(2)]
+
+
+@pytest.mark.parametrize("astray", [0, 1])
+@pytest.mark.parametrize(("share", "shaken"), [(0.9, 0), (1.1, 1)])
+def test_a_joint_that_is_astray_shakes_the_other_and_not_itself(astray: int, share: float, shaken: int) -> None:
+    arm = Arm().run(300)
+    state, limits = arm.state[astray], arm.constants[astray].limits
+    state.reference.position_rad = state.measured_position_rad
+    state.measured_position_rad += share * ASTRAY_SHARE * limits.following_error_max_rad
+    arm.run(1)
+    assert [int(arm.state[axis].shaken) for axis in (astray, 1 - astray)] == [0, shaken]
 
 
 @pytest.mark.parametrize("fell", [0, 1])

@@ -122,6 +122,7 @@ def test_a_status_with_the_servo_on_does_not_pass_for_a_motor_that_was_switched_
 def state_with(notices: int) -> Any:
     state = new(AxisState)[0]
     state.notices, state.swing.noise_told_Nm, state.law.learning.error_rad = notices, 12.04, 3.21e-5
+    state.measured_position_rad, state.stood_rad = 0.487, 0.5
     return state
 
 
@@ -130,6 +131,7 @@ def state_with(notices: int) -> Any:
     [
         (Notice.TORQUE_NOISE, ("12.0 Nm", "encoder", "velocity_cutoff_Hz", "observer_radps")),
         (Notice.LEARNING_OFF, ("0.032 mrad", "control.learning.gain", "loop delay", "off")),
+        (Notice.SANK, ("-0.0130 rad", "torque was released", "nothing but a brake holds it", "support it")),
     ],
 )
 def test_each_notice_is_told_once_in_a_run(notice: Notice, words: tuple[str, ...]) -> None:
@@ -139,10 +141,10 @@ def test_each_notice_is_told_once_in_a_run(notice: Notice, words: tuple[str, ...
     assert (event.time_ns, event.level, event.source) == (7, WARNING, "loop")
     assert all(word in event.text for word in words)
     assert finder.take(state_with(notice), 8) == []
-    both = Notice.TORQUE_NOISE | Notice.LEARNING_OFF
-    assert len(finder.take(state_with(both), 9)) == 1  # the other one
-    assert finder.take(state_with(both), 10) == []
-    assert len(NoticeFinder().take(state_with(both), 0)) == 2
+    every = sum(Notice)
+    assert len(finder.take(state_with(every), 9)) == len(Notice) - 1  # the other ones
+    assert finder.take(state_with(every), 10) == []
+    assert len(NoticeFinder().take(state_with(every), 0)) == len(Notice)
 
 
 def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from jointctl.firmware_py.records import AxisState, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
-from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward, Reaction, StopRequest
+from jointctl.firmware_py.states import (
+    AxisPhase,
+    DriveRequest,
+    DriveState,
+    Fault,
+    FeedForward,
+    Notice,
+    Reaction,
+    StopRequest,
+)
 from tests.axis_on_stub_joint import POWERED, NewRig, finish, step_axis
 
 
@@ -94,6 +103,25 @@ def test_release_is_a_straight_line_to_zero(rig: NewRig) -> None:
     assert len(released) == 10
     np.testing.assert_allclose(np.diff(released), released[1] - released[0], rtol=1e-9)
     assert run.torques_Nm[-1] == 0.0
+
+
+@pytest.mark.parametrize(("load_Nm", "notices"), [(0.0, 0), (100.0, Notice.SANK)])
+def test_a_load_that_friction_does_not_hold_is_no_fault_of_a_stop(rig: NewRig, load_Nm: float, notices: int) -> None:
+    """The drive brakes it before the power goes off, and the run has ended as it was asked to."""
+    run = rig(0.0)
+    run.axis.sequence.release_s = 0.2
+    run.until(AxisPhase.TRACKING)
+    run.stop = StopRequest.RAMP
+    run.until(AxisPhase.RELEASING)
+    run.joint.load_Nm = load_Nm
+    stood_rad = run.joint.position_rad
+    while run.phase is AxisPhase.RELEASING:
+        run.tick()
+    assert run.phase == (AxisPhase.QUICK_STOPPING if notices else AxisPhase.DISABLING)
+    assert abs(run.joint.position_rad - stood_rad) < 0.3 * run.axis.limits.following_error_max_rad
+    run.joint.load_Nm = 0.0
+    finish(run)
+    assert (run.state.fault, run.state.notices) == (Fault.NONE, notices)
 
 
 def test_ramp_decelerates_as_configured(rig: NewRig) -> None:

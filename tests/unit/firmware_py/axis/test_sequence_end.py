@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.records import LINE_GONE
-from jointctl.firmware_py.safety import enter
+from jointctl.firmware_py.safety import SINKS_SHARE, check_release, enter
 from jointctl.firmware_py.sequence import ANSWER_CYCLES, released_torque_Nm, step_stopping
-from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Notice, Reaction
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 
 
@@ -27,6 +27,22 @@ def test_the_torque_is_released_along_a_straight_line(
     left = max(release_cycles - phase_cycle, 0.0)
     assert torque_Nm == pytest.approx(12.0 * left / (left + elapsed_cycles), abs=1e-9)
     assert state.phase == (AxisPhase.RELEASING if left else AxisPhase.DISABLING)
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize(("share", "sinks"), [(0.999, False), (-0.999, False), (1.001, True), (-1.001, True)])
+def test_a_joint_that_sinks_while_its_torque_is_released_is_braked_by_its_drive(
+    axis: Any, state: Any, phase: AxisPhase, share: float, sinks: bool
+) -> None:
+    """From where it stood when the release began, whatever the error was then."""
+    sinks = sinks and phase is AxisPhase.RELEASING
+    state.phase, state.measured_position_rad = phase, 0.3
+    check_release(axis, state)
+    state.phase_cycle = 1
+    state.measured_position_rad += share * SINKS_SHARE * axis.limits.following_error_max_rad
+    check_release(axis, state)
+    assert state.phase == (AxisPhase.QUICK_STOPPING if sinks else phase)
+    assert (state.notices, state.fault) == (Notice.SANK if sinks else 0, Fault.NONE)
 
 
 @pytest.mark.parametrize("drive_state", DriveState)

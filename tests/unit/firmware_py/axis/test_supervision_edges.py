@@ -7,7 +7,16 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.records import AxisState, Sample
-from jointctl.firmware_py.safety import PUSHED_CYCLES, check_reading, check_supervision, check_suspension, reaction_to
+from jointctl.firmware_py.safety import (
+    ASTRAY_SHARE,
+    PUSHED_CYCLES,
+    SHAKEN_CYCLES,
+    check_reading,
+    check_supervision,
+    check_suspension,
+    is_astray,
+    reaction_to,
+)
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, Reaction
@@ -245,6 +254,41 @@ def test_of_an_arm_what_the_other_joints_ask_for_pushes_none(
     state.command_torque_Nm, state.law.arm_torque_Nm = 4.0, asked_Nm
     check_reading(axis, state, 1)
     assert state.pushed_cycles == int(pushed)
+
+
+@pytest.mark.parametrize("shaken", [0, 1])
+def test_beside_a_joint_that_is_astray_a_push_must_last_longer(stuck: tuple[Any, Any], shaken: int) -> None:
+    """It counts what was when the push began: a joint that is pushed unseen drives others astray."""
+    axis, state = stuck
+    state.command_torque_Nm, state.shaken = 4.0, shaken
+    longest = SHAKEN_CYCLES if shaken else PUSHED_CYCLES
+    for _ in range(longest):
+        check_reading(axis, state, 1)
+        state.shaken = 1 - shaken
+    assert (state.pushed_cycles, state.fault) == (longest, Fault.NONE)
+    check_reading(axis, state, 1)
+    assert state.fault == Fault.POSITION_FROZEN
+
+
+def test_beside_a_joint_that_is_astray_the_way_of_the_reference_counts_as_ever(stuck: tuple[Any, Any]) -> None:
+    axis, state = stuck
+    state.shaken, state.frozen_way_rad = 1, 0.501
+    state.reference.position_rad = state.frozen_reference_rad = 0.501
+    check_reading(axis, state, 1)
+    assert state.fault == Fault.POSITION_FROZEN
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize(("share", "astray"), [(0.999, 0), (-0.999, 0), (1.001, 1), (-1.001, 1), (float("nan"), 1)])
+def test_a_joint_under_torque_far_from_its_reference_is_astray(
+    axis: Any, state: Any, phase: AxisPhase, share: float, astray: int
+) -> None:
+    state.phase, state.reference.position_rad = phase, 0.3
+    state.measured_position_rad = 0.3 + share * ASTRAY_SHARE * axis.limits.following_error_max_rad
+    under_torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
+    assert is_astray(axis.limits, state) == (astray if under_torque else 0)
+    state.saturated_cycles = 1
+    assert is_astray(axis.limits, state) == int(under_torque)
 
 
 @pytest.mark.parametrize("by", ["less torque", "a reading that moves"])
