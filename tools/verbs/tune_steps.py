@@ -74,6 +74,7 @@ MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_L
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
+SWEEP_OBSERVER_radps = 50.0
 SWARM = SwarmSettings(particles=300, iterations=1500)
 STANDS, STANDSTILL_SHARE = 1.2, 0.1  # times what a count reads, and at most that of limits.velocity_max_radps
 VERIFY_s, VERIFY_FROM_s = 30.0, 5.0
@@ -245,8 +246,14 @@ class Tune:
         return with_break_away(self.config, max(numbers)) if max(numbers) > 0.0 else without_friction(self.config)
 
     def _sliding(self) -> Config:
-        """With what the legs of the response say of the friction: at low speed a soft law sticks without it."""
+        """With what the legs of the response say of the friction: at low speed a soft law sticks without it.
+
+        And a quick observer hunts there.
+        """
         config, kept = self._before_friction(), self.state["response"]["gravity"]
+        observer_radps = min(config.control.observer_radps, SWEEP_OBSERVER_radps)
+        control = config.control.model_copy(update={"observer_radps": observer_radps})
+        config = config.model_copy(update={"control": control})
         static_Nm = static_friction_Nm(config)
         if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
             return config
