@@ -12,7 +12,7 @@ from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step
 from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.motion_records import MotionChange, Reference
-from jointctl.firmware_py.observers import coast_velocity, step_velocity
+from jointctl.firmware_py.observers import BRIDGED_CYCLES, coast_velocity, step_velocity
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -83,12 +83,16 @@ MOVES_AGAIN = 3.0  # times `standstill_radps`: a joint that has stood does so no
 def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> int:
     """Position of this cycle; periods since the last sample, 0 if there is no new one.
 
-    Between samples the joint is assumed to do what it is told.
+    Between samples the joint is assumed to move on, and soon as it is told.
     """
     if sample.count == state.sample_count:
         state.sample_age_cycles += elapsed_cycles
         state.good_samples = 0
-        coast_velocity(constants.velocity, state.velocity, elapsed_cycles)
+        if state.sample_age_cycles > BRIDGED_CYCLES:
+            radps, flexible, own = state.reference.velocity_radps, constants.law.flexible, state.law.flexible
+            coast_velocity(constants.velocity, state.velocity, radps, elapsed_cycles)
+            coast_velocity(flexible.motor_velocity, own.motor_velocity, radps, elapsed_cycles)
+            coast_velocity(flexible.link_velocity, own.link_velocity, radps, elapsed_cycles)
         moved_rad = state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
         state.measured_position_rad += moved_rad
         state.second_position_rad += moved_rad

@@ -31,7 +31,7 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.observers import coast_velocity, step_velocity
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import KNEES, FlexibleConstants, FlexibleState, HarmonicSeries, LawConstants, LawState
 from jointctl.firmware_py.states import Encoders
 
@@ -211,9 +211,6 @@ def motor_and_link_errors(
         gap = max(reading.gap_cycles, 1)
         step_velocity(constants.motor_velocity, state.motor_velocity, motor, motor_error, gap)
         step_velocity(constants.link_velocity, state.link_velocity, position, link_error, gap)
-    else:
-        coast_velocity(constants.motor_velocity, state.motor_velocity, 1)
-        coast_velocity(constants.link_velocity, state.link_velocity, 1)
     apart = link_error - motor_error
     if state.primed == 0:
         state.primed = 1

@@ -19,6 +19,7 @@ from jointctl.firmware_py.records import (
 )
 
 COAST_s = 0.01  # in which a velocity that is not read comes to that of the reference
+BRIDGED_CYCLES = 2  # without a sample, before it does: filters are slower, and lose damping where single ones are lost
 
 
 @kernel
@@ -51,14 +52,16 @@ def step_velocity(
 
 
 @kernel
-def coast_velocity(constants: VelocityConstants, state: VelocityState, elapsed_cycles: int) -> None:
-    """Periods without a sample: the velocity comes to that of the reference, as the loop would have it.
+def coast_velocity(
+    constants: VelocityConstants, state: VelocityState, reference_radps: float, elapsed_cycles: int
+) -> None:
+    """More periods without a sample: the velocity comes to that of the reference, as the loop would have it.
 
     Held, its last noise would push the joint for as long as nothing is read.
     """
-    lost_radps = state.error_rate_radps * -math.expm1(-elapsed_cycles * constants.period_s / COAST_s)
-    state.error_rate_radps -= lost_radps
-    state.velocity_radps -= lost_radps
+    share = -math.expm1(-elapsed_cycles * constants.period_s / COAST_s)
+    state.error_rate_radps -= share * state.error_rate_radps
+    state.velocity_radps += share * (reference_radps - state.velocity_radps)
 
 
 # --- Error, its rate and a disturbance by a Kalman filter: for an encoder too coarse for differences ---

@@ -511,7 +511,7 @@ class AxisState:
     still_cycles: i8
     frozen_samples: i8  # in a row, without a gap, that did not change
     pushed_cycles: i8  # of them with more torque than frozen_torque_Nm
-    pushed_max_cycles: i8  # that are allowed, since it began
+    pushed_max_cycles: i8  # that are allowed while the reading stands still; 0 = no push since it does
     frozen_way_rad: f8  # how far the reference has moved since the reading last changed
     frozen_reference_rad: f8  # where the reference was when that was last looked at
     frozen_at_rad: f8  # that reading

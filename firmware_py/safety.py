@@ -46,6 +46,7 @@ PUSHED_CYCLES = 20  # at a torque that a healthy joint gives way to: it moves by
 SHAKEN_CYCLES = 100  # the same, if another joint of the arm was astray when it began, and may be what pushes back
 ASTRAY_SHARE = 0.5  # of following_error_max_rad: what such a joint does to the others is not what the model knows
 SINKS_SHARE = 0.25  # of following_error_max_rad: a joint without torque that has moved farther is not held by friction
+SINKS_TOLERANCES = 4.0  # of a reading that stands still: so far it has moved at least
 
 # one bit for the code of each fault with that reaction
 POWER_OFF_FAULTS = sum(1 << fault for fault in Fault if fault.reaction is Reaction.OFF)
@@ -347,7 +348,8 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     the way that the reference has gone, as much as it is behind is held against the reading, and what is beyond
     `frozen_ahead_rad` in any case.  Where the drive closes a loop itself, the torque is the one that it measures; in an
     arm it is what the command has beyond the arm's own.  A joint that is astray throws the others, which stand still
-    against that: it is to be the first that is reported.  One that goes astray only after the push does not count.
+    against that: it is to be the first that is reported.  One that goes astray after the first push of a standstill
+    does not count.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
@@ -363,6 +365,7 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     if state.frozen_samples == 0:
         state.frozen_way_rad = 0.0
         state.pushed_cycles = 0
+        state.pushed_max_cycles = 0
     elif state.sample_age_cycles == 0:
         behind_rad = state.reference.position_rad - state.measured_position_rad
         if way_rad < 0.0:
@@ -371,7 +374,7 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
         if 0.0 < limits.frozen_max_rad < held_against_rad:
             trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
-            if state.pushed_cycles == 0:
+            if state.pushed_max_cycles == 0:
                 state.pushed_max_cycles = SHAKEN_CYCLES if state.shaken != 0 else PUSHED_CYCLES
             state.pushed_cycles += 1
             if state.pushed_cycles > state.pushed_max_cycles:
@@ -382,7 +385,7 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
 
 @kernel
 def is_astray(limits: LimitConstants, state: AxisState) -> int:
-    """1 for a joint under torque at its torque limit, or far from its reference, or whose error is no number."""
+    """1 for a joint under torque that was at its torque limit a moment ago, is far from its reference, or nowhere."""
     if not powered(state.phase):
         return 0
     error_rad = state.measured_position_rad - state.reference.position_rad
@@ -430,7 +433,8 @@ def check_motion(constants: AxisConstants, state: AxisState) -> None:
 @kernel
 def sinks(limits: LimitConstants, state: AxisState) -> bool:
     """Whether a joint that no torque holds has left the place where it stood when that began."""
-    return not abs(state.measured_position_rad - state.stood_rad) <= SINKS_SHARE * limits.following_error_max_rad
+    allowed_rad = max(SINKS_SHARE * limits.following_error_max_rad, SINKS_TOLERANCES * limits.frozen_tolerance_rad)
+    return not abs(state.measured_position_rad - state.stood_rad) <= allowed_rad
 
 
 @kernel

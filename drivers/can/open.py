@@ -312,5 +312,5 @@ def receive_only(bus: can.BusABC, identifiers: Iterable[tuple[int, int]]) -> Non
 
     Only where the system filters: python-can's own filter takes longer than listeners that ignore a frame.
     """
-    if isinstance(bus, virtual_bus.VirtualBus) or type(bus).__module__.startswith("can.interfaces.socketcan"):
+    if isinstance(bus, virtual_bus.VirtualBus) or type(bus).__module__.startswith("can.interfaces.socketcan."):
         bus.set_filters([{"can_id": wanted, "can_mask": mask, "extended": False} for wanted, mask in identifiers])

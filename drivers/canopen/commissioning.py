@@ -337,13 +337,19 @@ def lower_makers_limit(
             f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) is below one count of object {name} (torque limit), "
             f"{count_Nm:g} Nm by drive.torque_limit_rated_counts (={limit.rated_counts:g})"
         )
+    if counts * count_Nm < settings.torque_max_Nm * (1.0 - settings.rated_tolerance):
+        raise DeviceError(
+            f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) would be cut to {counts * count_Nm:g} Nm by object "
+            f"{name} (torque limit), whose count is {count_Nm:g} Nm: the loop would not notice that its torque is cut",
+            f"limits.torque_max_Nm = {counts * count_Nm:g} or less",
+        )
     before = objects.read(index, sub, what=TORQUE_LIMIT)
     if before < counts:
         raise DeviceError(
             f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) needs {counts} in object {name} (torque limit), which "
             f"holds {before} = {before * count_Nm:g} Nm and is only ever lowered",
             "correct drive.torque_limit_rated_counts, or set the limit in the maker's software; if a run was killed, "
-            "restart the drive",
+            "or could not reach the drive at its end, restart the drive",
         )
     objects.lower(index, sub, counts, before, what=TORQUE_LIMIT)
     return f"{name} = {counts} (was {before}) = {counts * count_Nm:.1f} Nm"

@@ -8,6 +8,7 @@ Time-outs are retried (drives leave SDOs unanswered now and then); an abort is a
 
 from __future__ import annotations
 
+import contextlib
 import io
 import random
 import struct
@@ -267,22 +268,24 @@ class ObjectAccess:
 
     def lower(self, index: int, sub: int, value: int, before: int, *, what: str) -> None:
         """`write_verified` of a limit that held `before`, which `give_limits_back` writes again."""
-        held, lowered, _ = self._lowered.get((index, sub), (before, before, what))
+        last = self._lowered.get((index, sub), (before, before, what))
+        held, lowered, _ = last
         self._lowered[index, sub] = (held if lowered == before else before), value, what
         try:
             self.write_verified(index, sub, value, what=what)
         except DeviceError as error:
-            del self._lowered[index, sub]
+            self._lowered[index, sub] = last
             if not was_refused(error):  # it holds something else now
-                self.write(index, sub, before, what=what)
+                with contextlib.suppress(DeviceError):
+                    self.write(index, sub, before, what=what)
             raise
 
     def give_limits_back(self) -> None:
         """Limits that `lower` has written hold what they held before; one that another program has set since stays."""
-        while self._lowered:
-            (index, sub), (before, lowered, what) = self._lowered.popitem()
+        for (index, sub), (before, lowered, what) in list(self._lowered.items()):
             if self.read(index, sub, what=what) == lowered != before:
                 self.write_verified(index, sub, before, what=what)
+            del self._lowered[index, sub]  # not before: where the drive did not answer, another call tries again
 
     def verified(self) -> dict[tuple[int, int], tuple[int, str]]:
         """What was written and read back since commissioning began: (index, sub) -> value and name."""

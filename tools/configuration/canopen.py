@@ -362,6 +362,8 @@ def canopen_problems(config: Config) -> list[str]:
                 )
     if (drive.torque_limit_object is None) != (drive.torque_limit_rated_counts is None):
         found.append("drive.torque_limit_object and drive.torque_limit_rated_counts must be given together")
+    if drive.rated_torque_unit == "uNm" and drive.rated_torque_Nm is None:  # a wrong unit would be a thousand times
+        found.append('drive.rated_torque_unit (="uNm") needs drive.rated_torque_Nm, which 6076 is compared with')
     # the other one follows from the torque constant: a drive that lacks 6075 or 6076 cannot be compared with it
     reference = f"{drive.torque_reference}_{'A' if drive.torque_reference == 'rated_current' else 'Nm'}"
     if config.virtual is not None and getattr(drive, reference) is None:

@@ -233,7 +233,10 @@ def _ratings(reader: SdoReader, found: FirstValues) -> None:
         reference = "rated_current" if current_mA else "rated_torque"
         found.suggested["drive", "torque_reference"] = reference, "the only one of 6075 and 6076 that the drive has"
     if torque_mNm and reader.value(0x1018, 1) == MAXON:
-        found.remarks.append('6076 counts µNm in a maxon drive: add rated_torque_unit = "uNm" to [drive]')
+        found.remarks.append(
+            "6076 was taken to count µNm, as in maxon's EPOS4: compare rated_torque_Nm with the motor's data sheet, "
+            'and add rated_torque_unit = "uNm" to [drive]'
+        )
     if reader.value(0x6072) is None:
         found.remarks.append(
             "no 6072 (max torque): name the maker's own limit in drive.torque_limit_object, see docs/drives"

@@ -103,6 +103,33 @@ def test_a_unit_that_is_wrong_by_a_thousand_does_not_switch_the_limit_off(tmp_pa
         drive.commission()
 
 
+def test_counts_so_coarse_that_the_torque_would_be_cut_are_refused(tmp_path: Path) -> None:
+    words = r"torque_max_Nm \(=60\) would be cut to 48\.4 Nm by object 3001:2 .* count is 12\.1 Nm"
+    with joint_of(tmp_path, drive__torque_limit_rated_counts=5) as joint, joint.opened() as drive, refusal(words):
+        drive.commission()
+    assert joint.downloads(*PLACE) == []
+
+
+def test_a_drive_that_did_not_answer_gets_it_back_when_it_is_made_safe_again(
+    epos: DeviceOnBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with epos.opened() as drive:
+        drive.commission()
+        read = drive._objects.read
+
+        def silent(index: int, *sub: int, what: str) -> int:
+            if index == PLACE[0]:
+                raise DeviceError("no answer")
+            return read(index, *sub, what=what)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(drive._objects, "read", silent)
+            assert drive.make_safe() == "switch on disabled"
+        assert epos.value(*PLACE) == 4958
+        drive.make_safe()
+    assert epos.value(*PLACE) == HELD
+
+
 @pytest.mark.parametrize(
     ("code", "held", "reason"),
     [(READ_ONLY, HELD, "object is read only"), (OUT_OF_RANGE, HELD, "value out of range"), (READ_ONLY, 4958, "")],
@@ -159,6 +186,12 @@ def test_a_drive_with_both_gets_both(tmp_path: Path) -> None:
 def test_what_the_keys_may_not_be(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         load_config(written(tmp_path / "joint.toml", **keys(**changes)))
+
+
+def test_a_unit_that_nothing_would_be_compared_with_is_refused(tmp_path: Path) -> None:
+    """A drive that counts mNm would have a thousandth of its rated torque, and be sent a thousand times as much."""
+    with pytest.raises(ConfigurationError, match=r'rated_torque_unit \(="uNm"\) needs drive\.rated_torque_Nm'):
+        joint_of(tmp_path, drive__rated_torque_Nm=None)
 
 
 @pytest.mark.parametrize("unit", ["uNm", "mNm"])
