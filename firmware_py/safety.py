@@ -17,7 +17,6 @@ from jointctl.firmware_py.records import (
     Sample,
     SetPoint,
     StreamConstants,
-    SwingConstants,
     SwingState,
 )
 from jointctl.firmware_py.states import (
@@ -30,7 +29,7 @@ from jointctl.firmware_py.states import (
     Reaction,
     SetPointProblem,
 )
-from jointctl.firmware_py.swing import allow_reversal, note_rest, step_swing
+from jointctl.firmware_py.swing import allow_reversal, note_rest, step_swing, torque_noise
 from jointctl.firmware_py.trajectory import cubic
 
 # Half swings in a row that are a limit cycle; on 480 runs of healthy joints 2 at most of either kind, and 6 that grew.
@@ -348,9 +347,8 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     the way that the reference has gone, as much as it is behind is held against the reading, and what is beyond
     `frozen_ahead_rad` in any case.  Where the drive closes a loop itself, the torque is the one that it measures; in an
     arm it is what the command has beyond the arm's own.  A joint that is astray throws the others, which stand still
-    against that: it is to be the first that is reported.  One that goes astray after the first push of a standstill
-    does not count.
-    Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
+    against that: it is to be reported first, if it was so at the first push of a standstill.  Of an overrun's
+    `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
     torque_Nm = state.command_torque_Nm
@@ -506,13 +504,9 @@ def watch_rest(constants: AxisConstants, state: AxisState, sample: Sample) -> No
 
 @kernel
 def swing_fault(
-    limits: LimitConstants,
-    state: SwingState,
-    torque_Nm: float,
-    error_rad: float,
-    reference_velocity_radps: float,
+    limits: LimitConstants, state: SwingState, torque_Nm: float, error_rad: float, reference_velocity_radps: float,
     cycle: int,
-) -> Fault:
+) -> Fault:  # fmt: skip
     """LIMIT_CYCLE if the torque reverses between shares of its limits, or an oscillation of the error stays or grows.
 
     `torque_Nm` is the command without what the desired acceleration asks for.  The error is compared with its limit, or
@@ -590,13 +584,6 @@ def check_saturation(limits: LimitConstants, state: AxisState, torque_Nm: float,
             trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
     else:
         state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
-
-
-@kernel
-def torque_noise(constants: SwingConstants, state: SwingState, change_Nm: float) -> bool:
-    """Take the change of the command in this cycle; whether their mean is more than is worth a warning."""
-    state.noise_Nm += constants.noise_gain * (abs(change_Nm) - state.noise_Nm)
-    return 0.0 < constants.noise_Nm < state.noise_Nm
 
 
 @kernel

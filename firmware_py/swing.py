@@ -1,9 +1,9 @@
-"""Does a quantity swing: turns in a row and how they grow, for `safety.check_swing`; what a reading does at rest."""
+"""Does a quantity swing: turns in a row and how they grow, for `safety.check_swing`; readings at rest; torque noise."""
 
 from __future__ import annotations
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import Swing, SwingState
+from jointctl.firmware_py.records import Swing, SwingConstants, SwingState
 
 GROWTH = 1.05  # from one half swing to the next
 REVERSAL_SWINGS = 3  # that friction alone makes of one reversal of the reference: they do not count
@@ -83,3 +83,10 @@ def note_rest(state: SwingState, position_rad: float, moving: bool) -> None:
     else:
         state.rest_rad = max(state.rest_rad, abs(position_rad - state.rest_position_rad))
     state.rest_position_rad = position_rad
+
+
+@kernel
+def torque_noise(constants: SwingConstants, state: SwingState, change_Nm: float) -> bool:
+    """Take the change of the command in this cycle; whether their mean is more than is worth a warning."""
+    state.noise_Nm += constants.noise_gain * (abs(change_Nm) - state.noise_Nm)
+    return 0.0 < constants.noise_Nm < state.noise_Nm
