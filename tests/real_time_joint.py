@@ -2,9 +2,6 @@
 
 A real drive answers in time whatever a computer is busy with.  So threads of the virtual ones come before ordinary
 programs (SCHED_FIFO), where the system allows it: as in `jointctl hil`.
-
-Bus, drives and loop wait for each other three times a cycle.  On a virtual machine waking a thread on another core took
-most of the processor time of these tests: those of one test share a core, and the supervisor has any.
 """
 
 from __future__ import annotations
@@ -25,20 +22,6 @@ BEFORE_A_LOOP, BELOW_A_LOOP = 60, 20  # priorities
 COMPILED = ("device", "virtual bus")  # the threads that never hold the interpreter's lock for long
 
 
-def core_of_this_process() -> int:
-    """Of the bus, the drives and the loop that this process tests; others take the other cores."""
-    cores = sorted(os.sched_getaffinity(0))
-    number = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
-    return cores[int(number) % len(cores)]
-
-
-def keep_on_core(*threads: int) -> None:
-    """Threads of any process, by their native ids."""
-    for thread in threads:
-        with contextlib.suppress(OSError):  # it has ended
-            os.sched_setaffinity(thread, {core_of_this_process()})
-
-
 def schedule(thread: int, policy: int, priority: int) -> None:
     """Schedule a thread of this process, by its native id; nothing happens without the right, or if it has ended."""
     with contextlib.suppress(OSError):
@@ -54,11 +37,10 @@ def real_time_joint(config: Config | ArmConfig) -> Iterator[Any]:
 
 
 def schedule_compiled() -> None:
-    """The compiled threads of this process come first, on its core."""
+    """The compiled threads of this process come first."""
     for thread in threading.enumerate():
         if thread.name != "device-sdo" and thread.name.startswith(COMPILED) and thread.native_id is not None:
             schedule(thread.native_id, os.SCHED_FIFO, BEFORE_A_LOOP)
-            keep_on_core(thread.native_id)
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from jointctl.tools.session.result import RunResult
 from jointctl.tools.virtual_joint import fault_constants
 from tests.configurations import written
 from tests.places import CONFIGS
-from tests.real_time_joint import core_of_this_process, real_time_joint
+from tests.real_time_joint import real_time_joint
 from tests.sessions import session_of
 
 SHIPPED = (CONFIGS / "virtual.toml").read_text()
@@ -48,7 +48,7 @@ def run_with(tmp_path: Path) -> RunWith:
             sequence__approach_s=0.3, virtual__initial_position_rad=0.0, trajectory__duration_s=tracking_s,
             # a busy computer must not be the fault that is seen
             limits__sample_age_max_s=0.25, limits__skipped_max_s=0.25, drive__heartbeat_s=heartbeat_s,
-            sequence__stop_timeout_s=1.0, sequence__off_timeout_s=0.7, loop__cpu=core_of_this_process(),
+            sequence__stop_timeout_s=1.0, sequence__off_timeout_s=0.7,
         )  # fmt: skip
         with path.open("a") as file:
             file.write(

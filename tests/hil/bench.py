@@ -21,7 +21,7 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
 from tests.python_process import Finished
-from tests.real_time_joint import core_of_this_process, keep_on_core, real_time_joint
+from tests.real_time_joint import real_time_joint
 
 
 class Started:
@@ -88,7 +88,6 @@ class Bench:
         short = {
             "bus__channel": self.channel, "trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0,
             "log__picture": False,  # test_demo.py looks at one
-            "loop__cpu": core_of_this_process(),
             # a busy computer must not be the fault that is seen
             "limits__sample_age_max_s": 0.15, "limits__skipped_max_s": 0.15,
         }  # fmt: skip
@@ -98,10 +97,7 @@ class Bench:
         """The shipped arm's files on this bus; `changes`: keys of any of them."""
         folder = self.folder / "arm"
         shutil.copytree(SHIPPED_ARM.parent, folder)
-        values = {
-            "channel": f'"{self.channel}"', "sample_age_max_s": 0.15, "skipped_max_s": 0.15,
-            "rate_Hz": f"1000.0\ncpu = {core_of_this_process()}", **changes,
-        }  # fmt: skip
+        values = {"channel": f'"{self.channel}"', "sample_age_max_s": 0.15, "skipped_max_s": 0.15, **changes}
         for path in folder.glob("*.toml"):
             text = path.read_text()
             for key, value in values.items():
@@ -128,9 +124,7 @@ class Bench:
 
     def joint_process(self, config: str) -> Started:
         """`jointctl hil`, ready for others."""
-        started = self.start("hil", config).saw("Ctrl-C ends it")
-        keep_on_core(*map(int, os.listdir(f"/proc/{started.process.pid}/task")))
-        return started
+        return self.start("hil", config).saw("Ctrl-C ends it")
 
     def network(self) -> Any:
         """An independent CANopen client on the bus."""
