@@ -557,6 +557,7 @@ def test_a_press_while_the_page_is_cut_off_is_refused_and_not_carried_out_later(
     _scope, tab, url = opened(bench, browser)
     tab.click("clear")
     tab.until("!document.querySelector('[data-testid=\"start\"]').disabled")
+    time.sleep(0.5)  # the page has come to rest: a mouse does not press what moves
     tab.js("void window.socket.disconnect()")
     tab.click("start")
     tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('NOT CONNECTED')")
