@@ -206,6 +206,8 @@ def sinking(late: int, share: float) -> Arm:
     """The drive of `late` does not enable; the other joint has moved by `share` of what a joint may sink by."""
     arm = Arm()
     arm.slow_to_enable[late] = 1 << 30
+    for axis in range(2):
+        arm.constants[axis].limits.position_jump_max_rad = 1.0
     while arm.memory.sample.drive_state[1 - late] != DriveState.ENABLED:
         arm.run(1)
     arm.run(5)
@@ -218,8 +220,6 @@ def sinking(late: int, share: float) -> Arm:
 def test_an_enabled_joint_that_sinks_is_laid_to_the_drive_that_it_waits_for(late: int, share: float) -> None:
     """All are off in the same cycle."""
     arm = sinking(late, share)
-    for axis in range(2):
-        arm.constants[axis].limits.position_jump_max_rad = 1.0
     arm.run(1)
     assert arm.faults == [Fault.ENABLE_TIMEOUT if axis == late else Fault.NONE for axis in range(2)]
     assert list(arm.memory.command.request) == [DriveRequest.OFF] * 2
@@ -230,8 +230,6 @@ def test_an_enabled_joint_that_sinks_is_laid_to_the_drive_that_it_waits_for(late
 @pytest.mark.parametrize("share", [0.999, -0.999])
 def test_its_twin_that_sags_a_little_waits_and_begins_with_the_other(late: int, share: float) -> None:
     arm = sinking(late, share)
-    for axis in range(2):
-        arm.constants[axis].limits.position_jump_max_rad = 1.0
     arm.run(3)
     assert (arm.phases, arm.faults) == ([AxisPhase.ENABLING] * 2, [Fault.NONE] * 2)
     arm.slow_to_enable[late] = 0
@@ -254,8 +252,6 @@ def test_a_joint_that_is_waited_for_since_its_samples_stay_away_is_named_for_tha
 ) -> None:
     """A drive that was enabled when it was last heard may be so still."""
     arm = sinking(late, 0.0)
-    for axis in range(2):
-        arm.constants[axis].limits.position_jump_max_rad = 1.0
     if enabled:
         arm.memory.sample[late].drive_state = DriveState.ENABLED
     arm.silent[late] = True
