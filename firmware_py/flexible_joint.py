@@ -31,8 +31,16 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.observers import step_velocity
-from jointctl.firmware_py.records import KNEES, FlexibleConstants, FlexibleState, HarmonicSeries, LawConstants, LawState
+from jointctl.firmware_py.observers import low_pass_gain, step_velocity
+from jointctl.firmware_py.records import (
+    KNEES,
+    AdaptationState,
+    FlexibleConstants,
+    FlexibleState,
+    HarmonicSeries,
+    LawConstants,
+    LawState,
+)
 from jointctl.firmware_py.states import Encoders
 
 
@@ -131,6 +139,7 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
         through += constants.coriolis_Nmspr * speed
         bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
     twist, compliance = twist_of(flexible, through)
+    own.friction_twist_rad = compliance * own.whole_friction_Nm
     # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
     ahead = link_rad + twist
     motor_rad = own.motor_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
@@ -217,3 +226,78 @@ def motor_and_link_errors(
         state.twist_error_rad = apart
     state.twist_error_rad += constants.twist_gain * (apart - state.twist_error_rad)
     return motor_error, link_error
+
+
+# --- What adaptation sees of such a joint (`friction`) ---
+# The observer of the loop has the bandwidth that the loop bears, and its speeds are filtered as much as that needs:
+# next to it friction that changes within milliseconds is taken for something else.  Adaptation therefore has an
+# observer of its own on the momentum of both masses, whose disturbance moves nothing.
+#
+# How much of the friction lies behind the reducer decides by how much the reducer springs over where the motion turns
+# back, and the motor has to make up for that before the link moves.  The two encoders show it:
+#
+#     (y_l - q_d) - (y_m - theta_d) = expected twist - twist = offset + (share fed forward - share) C F
+#
+# with the compliance C and the friction F that is fed forward.  A Kalman filter follows both.  Hysteresis of the
+# reducer looks like friction of the other sign, and is found with it.
+
+SEEN_radps = 80.0  # bandwidth of that observer
+SEEN_Hz = 100.0  # of the low-pass on its speeds, behind which all else is that it is compared with
+LARGEST_SHARE = 0.4
+TWIST_NOISE_rad = 3e-4  # of a sample: what the masses swing, and samples are not independent
+OFFSET_VARIANCE_rad2, SHARE_VARIANCE = 1e-7, 1e-2  # at first
+TWIST_DRIFT = 1e-4  # of these, that comes back in each step
+
+
+@kernel
+def see_motion(
+    law: LawConstants, state: AdaptationState, applied_Nm: float, motor_rad: float, link_rad: float, gap_cycles: int
+) -> None:
+    """One cycle of the observer: `applied_Nm` of the feedback alone, the errors of motor and link."""
+    if state.primed == 0:
+        state.primed = 1
+        state.motor_rate_radps = state.link_rate_radps = 0.0
+        state.integral_Nms = state.disturbance_Nm = 0.0
+        state.twist_covariance[0, 0], state.twist_covariance[1, 1] = OFFSET_VARIANCE_rad2, SHARE_VARIANCE
+        state.twist_covariance[0, 1] = state.twist_covariance[1, 0] = 0.0
+        state.motor_error_rad, state.link_error_rad = motor_rad, link_rad
+    elif gap_cycles > 0:
+        interval_s, gain = gap_cycles * law.period_s, law.adaptation.seen_gain
+        if gap_cycles > 1:
+            gain = low_pass_gain(SEEN_Hz, interval_s)
+        state.motor_rate_radps += gain * ((motor_rad - state.motor_error_rad) / interval_s - state.motor_rate_radps)
+        state.link_rate_radps += gain * ((link_rad - state.link_error_rad) / interval_s - state.link_rate_radps)
+        state.motor_error_rad, state.link_error_rad = motor_rad, link_rad
+    momentum_Nms = law.flexible.motor_inertia_kgm2 * state.motor_rate_radps
+    momentum_Nms += law.flexible.link_inertia_kgm2 * state.link_rate_radps
+    state.integral_Nms += law.period_s * (applied_Nm - state.disturbance_Nm)
+    state.disturbance_Nm = SEEN_radps * (state.integral_Nms - momentum_Nms)
+
+
+@kernel
+def seen_disturbance_Nm(law: LawConstants, state: AdaptationState, fed_Nm: float) -> tuple[float, float, float]:
+    """(bandwidth [rad/s], disturbance [Nm], what was fed forward [Nm] as late as that is seen)."""
+    state.fed_seen_Nm += law.adaptation.seen_gain * (fed_Nm - state.fed_seen_Nm)
+    return SEEN_radps, state.disturbance_Nm, state.fed_seen_Nm
+
+
+@kernel
+def adapt_link_share(
+    constants: FlexibleConstants, state: AdaptationState, friction_twist_rad: float, apart_rad: float
+) -> None:
+    """Learn from `apart_rad`, by which link and motor are nearer than expected; with both encoders."""
+    if constants.encoders != Encoders.BOTH:
+        return
+    covariance = state.twist_covariance
+    offset = covariance[0, 0] + covariance[0, 1] * friction_twist_rad
+    share = covariance[1, 0] + covariance[1, 1] * friction_twist_rad
+    size = TWIST_NOISE_rad * TWIST_NOISE_rad + offset + friction_twist_rad * share
+    error = (apart_rad - state.twist_offset_rad) / size
+    state.twist_offset_rad += offset * error
+    state.link_share = min(max(state.link_share - share * error, 0.0), LARGEST_SHARE)
+    covariance[0, 0] -= offset * offset / size
+    covariance[0, 1] -= offset * share / size
+    covariance[1, 0] = covariance[0, 1]
+    covariance[1, 1] -= share * share / size
+    covariance[0, 0] = min(covariance[0, 0] + TWIST_DRIFT * OFFSET_VARIANCE_rad2, OFFSET_VARIANCE_rad2)
+    covariance[1, 1] = min(covariance[1, 1] + TWIST_DRIFT * SHARE_VARIANCE, SHARE_VARIANCE)

@@ -255,6 +255,7 @@ def step_lugre(
 #
 # The disturbance observer (bandwidth L) has d = LP_L(friction - what was fed forward).  With the same low-pass on
 # every part, now driven by the motion that is measured, d + LP_L(fed forward) = w^T LP_L(parts): a linear regression.
+# Of a joint that is not rigid, d is that of an observer of its own (`flexible_joint.see_motion`).
 # A Kalman filter solves it every `EVERY` cycles, for weights that drift slowly.  Driven by the desired motion the
 # parts would be off where bristles give way, by as much as the joint is: soft and stiff ones would be mistaken for
 # each other.
@@ -290,8 +291,8 @@ def first_variance(constants: AdaptationConstants, part: int) -> float:
 
 
 @kernel
-def reset_adaptation(constants: AdaptationConstants, state: AdaptationState) -> None:
-    """Back to the configured friction."""
+def reset_adaptation(constants: AdaptationConstants, state: AdaptationState, link_share: float) -> None:
+    """Back to the configured friction, of which the link has this share."""
     for i in range(ADAPTED_PARTS):
         state.weights[i] = 0.0
         state.filtered_Nm[i] = 0.0
@@ -301,14 +302,40 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState) -> 
     for k in range(BRISTLES):
         state.desired_deflection_rad[k] = 0.0
         state.deflection_rad[k] = 0.0
+        state.link_deflection_rad[k] = 0.0
     for side in range(2):
         state.weights[2 * AS_CONFIGURED + side] = 1.0
     state.fed_filtered_Nm = 0.0
+    state.primed = 0
+    state.fed_seen_Nm = 0.0
+    state.link_share = link_share
+    state.twist_offset_rad = 0.0
     state.resting = 0
     state.cycle = 0
     state.newest = 0
     for i in range(len(state.fed_Nm)):
         state.fed_Nm[i] = 0.0
+
+
+@kernel
+def adapted_bristles_Nm(
+    law: LawConstants, state: AdaptationState, deflections_rad: np.ndarray, velocity_radps: float,
+    condition: Condition = UNLOADED,
+) -> float:  # fmt: skip
+    """Friction at the joint [Nm] after a cycle at the desired speed; moves its bristles, shape (BRISTLES,)."""
+    sliding_Nm = 0.0
+    if velocity_radps != 0.0:
+        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
+    fed = 0.0
+    for k in range(BRISTLES):  # all slide at the same torque
+        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
+        torque = stiffness * deflections_rad[k]
+        if velocity_radps != 0.0:
+            deflections_rad[k], torque = bend_bristles(
+                stiffness, law.lugre.damping_Nmspr, deflections_rad[k], velocity_radps, sliding_Nm, law.period_s
+            )
+        fed += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
+    return fed
 
 
 @kernel
@@ -318,19 +345,7 @@ def adapted_feed_forward_Nm(
 ) -> float:  # fmt: skip
     """Friction and ripple at the joint [Nm] of the desired motion, `position_rad` that of the motor / n."""
     constants = law.adaptation
-    sliding_Nm = 0.0
-    if velocity_radps != 0.0:
-        sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)
-    fed = 0.0
-    for k in range(BRISTLES):  # all slide at the same torque
-        stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        torque = stiffness * state.desired_deflection_rad[k]
-        if velocity_radps != 0.0:
-            state.desired_deflection_rad[k], torque = bend_bristles(
-                stiffness, law.lugre.damping_Nmspr, state.desired_deflection_rad[k], velocity_radps, sliding_Nm,
-                law.period_s,
-            )  # fmt: skip
-        fed += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
+    fed = adapted_bristles_Nm(law, state, state.desired_deflection_rad, velocity_radps, condition)
     for j in range(constants.ripples):
         turns = constants.ripple_turns_prad[j] * position_rad
         fed += state.weights[SINES + 2 * j] * sine_of_turns(turns + 0.25)
@@ -381,6 +396,7 @@ def fed_before_Nm(law: LawConstants, state: AdaptationState, fed_Nm: float) -> f
 def adapt(
     law: LawConstants,
     state: AdaptationState,
+    bandwidth_radps: float,
     explained_Nm: float,
     fed_Nm: float,
     desired_radps: float,
@@ -390,11 +406,11 @@ def adapt(
 ) -> None:
     """Learn from one cycle.
 
-    `explained_Nm` is the observer's disturbance, `fed_Nm` all that was fed forward and that the observer is to leave;
-    position and velocity are the measured ones, of the motor / n.
+    `explained_Nm` is the disturbance that an observer of that bandwidth has found, `fed_Nm` all that was fed forward
+    and that it is to leave; position and velocity are the measured ones, of the motor / n.
     """
     constants = law.adaptation
-    share = law.observer.bandwidth_radps * law.period_s
+    share = bandwidth_radps * law.period_s
     sliding_Nm = 0.0
     if velocity_radps != 0.0:
         sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)

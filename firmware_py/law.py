@@ -8,14 +8,18 @@ import math
 
 from jointctl.firmware_py.flexible_joint import (
     Reading,
+    adapt_link_share,
     desired_motor,
     motor_and_link_errors,
     reset_flexible,
+    see_motion,
+    seen_disturbance_Nm,
     value_at,
 )
 from jointctl.firmware_py.friction import (
     Condition,
     adapt,
+    adapted_bristles_Nm,
     adapted_feed_forward_Nm,
     compensation_motor_torque_Nm,
     condition_of,
@@ -34,6 +38,7 @@ from jointctl.firmware_py.observers import (
     reset_observer,
     step_kalman,
     step_observer,
+    torque_at_work_Nm,
 )
 from jointctl.firmware_py.records import (
     LEARNING_BINS,
@@ -301,7 +306,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     state.temperature_degC = constants.friction.reference_degC
     follow_temperature(constants, state, True)
     reset_flexible(state.flexible)
-    reset_adaptation(constants.adaptation, state.adaptation)
+    reset_adaptation(constants.adaptation, state.adaptation, constants.flexible.link_friction_share)
     state.arm_torque_Nm = 0.0
     state.lugre_deflection_rad = 0.0
     state.integral_rads = 0.0
@@ -377,8 +382,11 @@ def _adapt(
     add_to_disturbance(constants.observer, state.observer, -taken_Nm)
     state.observer_torque_Nm = state.observer.disturbance_Nm
     fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
+    bandwidth_radps, seen_Nm = constants.observer.bandwidth_radps, state.observer_torque_Nm
+    if constants.kind == ControllerKind.FLEXIBLE_JOINT:
+        bandwidth_radps, seen_Nm, fed_Nm = seen_disturbance_Nm(constants, state.adaptation, fed_Nm)
     adapt(
-        constants, state.adaptation, state.observer_torque_Nm, fed_Nm, desired_radps, position_rad,
+        constants, state.adaptation, bandwidth_radps, seen_Nm, fed_Nm, desired_radps, position_rad,
         desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
     )  # fmt: skip
 
@@ -507,13 +515,17 @@ def step_law(
 def _link_friction(constants: LawConstants, state: LawState, link_radps: float, condition: Condition) -> None:
     """That share of the friction which the reducer transmits, of the motion that is fed forward."""
     own, share = state.flexible, constants.flexible.link_friction_share
-    own.link_friction_Nm = share * state.friction_torque_Nm
-    if constants.feed_forward == FeedForward.LUGRE_DESIRED:
-        own.link_deflection_rad, torque_Nm = step_lugre(
+    own.whole_friction_Nm = state.friction_torque_Nm
+    if constants.adaptation.enabled != 0:
+        seen = state.adaptation
+        share = seen.link_share
+        own.whole_friction_Nm = adapted_bristles_Nm(constants, seen, seen.link_deflection_rad, link_radps, condition)
+    elif constants.feed_forward == FeedForward.LUGRE_DESIRED:
+        own.link_deflection_rad, own.whole_friction_Nm = step_lugre(
             constants.lugre, constants.friction, constants.reduction_ratio, own.link_deflection_rad, link_radps,
             constants.period_s, condition,
         )  # fmt: skip
-        own.link_friction_Nm = share * torque_Nm
+    own.link_friction_Nm = share * own.whole_friction_Nm
 
 
 @kernel
@@ -558,7 +570,11 @@ def step_flexible_law(
     if constants.adaptation.enabled != 0:
         known_Nm -= state.friction_torque_Nm
         moving_radps = own.target_radps if reference.velocity_radps != 0.0 else 0.0
-        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, rate_radps, transmitted_Nm)
+        at_work_Nm, seen = torque_at_work_Nm(constants.observer, state.observer), state.adaptation
+        see_motion(constants, seen, at_work_Nm, motor_rad, link_rad, reading.gap_cycles)
+        if moving_radps != 0.0 and seen.cycle == 0:
+            adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
+        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, seen.motor_rate_radps, transmitted_Nm)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

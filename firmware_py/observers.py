@@ -177,6 +177,12 @@ def applied_torque_Nm(constants: ObserverConstants, state: ObserverState, sent_t
     """The torque at work: that of `delay_cycles` before the command of the cycle before, which it takes note of."""
     state.newest = (state.newest + 1) % TORQUE_HISTORY
     state.sent_torque_Nm[state.newest] = sent_torque_Nm
+    return torque_at_work_Nm(constants, state)
+
+
+@kernel
+def torque_at_work_Nm(constants: ObserverConstants, state: ObserverState) -> float:
+    """The same once more in this cycle."""
     delay = min(max(constants.delay_cycles, 0), TORQUE_HISTORY - 1)
     return state.sent_torque_Nm[(state.newest - delay + TORQUE_HISTORY) % TORQUE_HISTORY]
 

@@ -89,6 +89,7 @@ class AdaptationConstants:
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
     late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
+    seen_gain: f8  # of the low-pass on the speeds that a flexible joint is seen to have
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
     ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
@@ -108,6 +109,19 @@ class AdaptationState:
     rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
     resting: i4
     cycle: i4
+    # of a joint that is not rigid, see `flexible_joint`
+    primed: i4
+    motor_error_rad: f8  # of the sample before, as the next
+    link_error_rad: f8
+    motor_rate_radps: f8  # how fast they change
+    link_rate_radps: f8
+    integral_Nms: f8  # of the observer
+    disturbance_Nm: f8
+    fed_seen_Nm: f8  # what is fed forward, behind the same low-pass as the speeds
+    link_deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # on the link's side, as desired
+    link_share: f8  # of the friction, that the reducer transmits
+    twist_offset_rad: f8  # of the twist, that is no friction
+    twist_covariance: Annotated[np.ndarray, array_of(f8, 2, 2)]  # of offset and share
 
 
 # --- The control law: network, observer, learning, and the law that holds them ---
@@ -244,6 +258,8 @@ class FlexibleState:
     ahead_radps: f8  # its speed
     followed: HarmonicSeries  # the part of the kinematic error that the motor makes up for
     link_friction_Nm: f8  # of that motion
+    whole_friction_Nm: f8  # what it would be if the link had all the friction
+    friction_twist_rad: f8  # by which that would twist the reducer
     link_deflection_rad: f8  # of its bristles
     motor_per_link: f8  # slope of the one against the other
     apart_rad: Annotated[np.ndarray, array_of(f8, LEAD_HISTORY)]  # of each cycle, motor from link in that motion

@@ -7,8 +7,8 @@ The least error of the link after a step of friction at the motor, subject to
 
 Searched by Nelder and Mead over kv and the observer's bandwidth; with the link's encoder alone, where the resonance
 lies between torque and encoder, over the velocity's cut-off too, and so where both encoders are read but bear only a
-soft loop, below SOFT_KV_1ps: what is late beside the resonance of a light motor bears more behind a filter far below
-it.  kp is KP_OF_KV kv^2: with less damping the search
+soft loop, below SOFT_KV_1ps: what is late beside the resonance of a light motor may bear so much more behind a filter
+far below it that it is WORTH_A_FILTER.  kp is KP_OF_KV kv^2: with less damping the search
 finds loops that a joint a little different from what is believed makes unstable, and so does an observer above
 LARGEST_OBSERVER_radps.  A constraint that is not met costs in proportion.  The motor's inertia may be wrong by
 MOTOR_ERROR besides.  The joints held by friction are left to the margin gate: what holds takes the resonance away.
@@ -33,6 +33,7 @@ LARGEST_NOISE_Nm = 0.6
 LARGEST_OBSERVER_radps = 110.0
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 SOFT_KV_1ps = 12.0
+WORTH_A_FILTER = 1.35  # by how much smaller the error must be: what repeats is learned badly behind one
 KP_OF_KV = 1.5
 MOTOR_ERROR = 0.15
 ROUNDED = 1.02  # by which a constraint may be missed, as the search ends near it
@@ -174,7 +175,8 @@ def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
     found = search.best_from(_START[settings.encoders])
     if settings.encoders == Encoders.BOTH and found.kv < SOFT_KV_1ps:
         filtered = search.best_from(_START_FILTERED)
-        found = min(found, filtered, key=lambda one: search.judged(one).cost)
+        if search.judged(found).cost - search.judged(filtered).cost > math.log(WORTH_A_FILTER):
+            found = filtered
     judged = search.judged(found)
     cutoff_Hz = found.cutoff_Hz if found.cutoff_Hz != settings.cutoff_Hz else None
     return FlexibleGains(found.kp, found.kv, found.observer_radps, judged.s_anywhere, judged.noise_Nm, cutoff_Hz)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.flexible_joint import SEEN_Hz
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
@@ -173,7 +174,7 @@ def _fill_law(law: LawConstants, config: Config) -> None:
         law.learning.growth = config.limits.learning_growth
     law.feed_forward_lead_s = lead_s = _feed_forward_lead_s(config)
     if control.adaptation is not None:
-        _fill_adaptation(law.adaptation, control.adaptation, joint.reduction_ratio)
+        _fill_adaptation(law.adaptation, config, control.adaptation)
         if control.observer_paired or control.kind == "flexible_joint":
             cycles = round(lead_s * config.loop.rate_Hz) or control.observer_delay_cycles + 1
             law.adaptation.late_cycles = min(cycles, FED_HISTORY - 1)
@@ -215,8 +216,10 @@ def _feed_forward_lead_s(config: Config) -> float:
     return delay_s + 0.5 * period_s(config) + config.margin.current_lag_s
 
 
-def _fill_adaptation(record: AdaptationConstants, adaptation: Adaptation, ratio: float) -> None:
+def _fill_adaptation(record: AdaptationConstants, config: Config, adaptation: Adaptation) -> None:
+    ratio = config.joint.reduction_ratio
     record.enabled = 1
+    record.seen_gain = plain(low_pass_gain)(SEEN_Hz, period_s(config))
     _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
     record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
     record.ripples = len(adaptation.ripple_per_motor_turn)

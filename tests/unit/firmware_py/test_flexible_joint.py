@@ -9,12 +9,23 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.flexible_joint import Reading, motor_and_link_errors, reset_flexible, series_at, twist_of
+from jointctl.firmware_py.flexible_joint import (
+    LARGEST_SHARE,
+    Reading,
+    SEEN_Hz,
+    adapt_link_share,
+    motor_and_link_errors,
+    reset_flexible,
+    see_motion,
+    series_at,
+    twist_of,
+)
+from jointctl.firmware_py.friction import reset_adaptation
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.observers import low_pass_gain
-from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState
+from jointctl.firmware_py.records import AdaptationState, FlexibleConstants, FlexibleState, LawConstants, LawState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, DriveState, Encoders, Fault, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
@@ -350,3 +361,58 @@ def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], mes
 def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     changes = {"limits__following_error_max_rad": 0.003, "limits__position_max_rad": 0.3535}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+
+
+def adapting() -> tuple[Any, Any]:
+    constants = flexible_law()[0]
+    law = constants[0]
+    law.period_s = 1e-3
+    law.adaptation.seen_gain = low_pass_gain(SEEN_Hz, law.period_s)
+    state = new(AdaptationState)
+    reset_adaptation(law.adaptation, state[0], 0.12)
+    return law, state[0]
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_the_observer_of_adaptation_finds_a_torque_with_and_without_each_sample(every: int) -> None:
+    """Both masses are driven off by 3 Nm, and the feedback holds against 1 Nm of it."""
+    law, state = adapting()
+    for k in range(400):
+        time_s = 1e-3 * k
+        error_rad = -0.5 * (3.0 - 1.0) / (JM + JL) * time_s * time_s
+        see_motion(law, state, 1.0, error_rad, error_rad, every if k % every == 0 else 0)
+    assert state.disturbance_Nm == pytest.approx(3.0, abs=0.1 * every)
+
+
+def learn_share(law: Any, state: Any, true: float, offset_rad: float, noise_rad: float = 0.0) -> None:
+    """Reversals for 20 s, of which the regression sees every tenth millisecond."""
+    random = np.random.default_rng(3)
+    for k in range(2000):
+        twist_rad = 1e-3 * math.tanh(5.0 * math.sin(0.08 * k))
+        apart_rad = (state.link_share - true) * twist_rad + offset_rad + noise_rad * random.standard_normal()
+        adapt_link_share(law.flexible, state, twist_rad, apart_rad)
+
+
+@pytest.mark.parametrize("true", [0.02, 0.12, 0.3])
+@pytest.mark.parametrize("offset_rad", [-3e-4, 3e-4])
+def test_the_share_of_the_link_is_found_beside_an_offset(true: float, offset_rad: float) -> None:
+    law, state = adapting()
+    learn_share(law, state, true, offset_rad, 1e-4)
+    assert state.link_share == pytest.approx(true, abs=0.01)
+    assert state.twist_offset_rad == pytest.approx(offset_rad, abs=5e-5)
+
+
+def test_the_share_of_the_link_stays_within_its_bounds() -> None:
+    for true, bound in ((-5.0, 0.0), (5.0, LARGEST_SHARE)):
+        law, state = adapting()
+        learn_share(law, state, true, 0.0)
+        assert state.link_share == bound
+        assert np.all(np.isfinite(state.twist_covariance))
+
+
+@pytest.mark.parametrize("encoders", [Encoders.MOTOR, Encoders.LINK])
+def test_one_encoder_tells_no_twist(encoders: Encoders) -> None:
+    law, state = adapting()
+    law.flexible.encoders = encoders
+    learn_share(law, state, 0.3, 0.0)
+    assert state.link_share == 0.12

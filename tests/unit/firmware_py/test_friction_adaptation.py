@@ -25,6 +25,7 @@ from jointctl.firmware_py.friction import (
 )
 from jointctl.firmware_py.records import BRISTLES, AdaptationState, LawConstants, LuGreConstants
 from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.config import Adaptation
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, named
@@ -52,7 +53,7 @@ def law() -> Any:
 
 def fresh(law: Any) -> Any:
     state = new(AdaptationState)[0]
-    reset_adaptation(law.adaptation, state)
+    reset_adaptation(law.adaptation, state, 0.0)
     return state
 
 
@@ -81,7 +82,7 @@ def follow(law: Any, state: Any, truth: Truth, duration_s: float) -> np.ndarray:
         true_Nm = truth.torque_Nm(position, velocity)
         fed_Nm = adapted_feed_forward_Nm(law, state, position, velocity)
         left.append(true_Nm - fed_Nm)
-        adapt(law, state, seen_Nm, fed_Nm, velocity, position, velocity)
+        adapt(law, state, 60.0, seen_Nm, fed_Nm, velocity, position, velocity)
         seen_Nm += 60.0 * 1e-3 * (left[-1] - seen_Nm)
     return np.array(left)
 
@@ -117,7 +118,8 @@ def test_no_torque_takes_the_weights_beyond_their_bounds(law: Any) -> None:
     for k in range(4000):
         velocity = 0.2 * math.cos(0.01 * k)
         torque = float(random.choice([-500.0, 0.0, 500.0]))
-        adapt(law, state, torque, adapted_feed_forward_Nm(law, state, 0.1, velocity), velocity, 0.1, velocity)
+        fed_Nm = adapted_feed_forward_Nm(law, state, 0.1, velocity)
+        adapt(law, state, 60.0, torque, fed_Nm, velocity, 0.1, velocity)
         friction = state.weights[: 2 * BRISTLES]
         assert np.all((friction >= 0.0) & (friction <= MOST + law.adaptation.reach))
         for side in (0, 1):
@@ -130,7 +132,7 @@ def test_nothing_adapts_while_the_desired_motion_rests(law: Any) -> None:
     follow(law, state, Truth(law, 8e4, (1.0, 1.0), 0.0), 1.0)
     before = state.weights.copy()
     for _ in range(1000):
-        adapt(law, state, 20.0, 0.0, 0.0, 0.1, 0.01)
+        adapt(law, state, 60.0, 20.0, 0.0, 0.0, 0.1, 0.01)
     assert np.array_equal(state.weights, before)
 
 
@@ -195,6 +197,27 @@ def test_motions_that_never_repeat_are_followed_better(kind: Any, more: dict[str
             assert figures.fault == ""
             found.append(figures.true_rmse_mrad)
     assert sum(after) < share * sum(before)
+
+
+@pytest.mark.parametrize("believed", [0.03, 0.25])
+def test_a_share_of_the_link_that_is_wrong_is_found_by_the_twist(believed: float) -> None:
+    """Reversals of the realistic joint without hysteresis: the share that is found, and the error with the true one."""
+    true, found, rmse = 0.1, [], []
+    for share in (true, believed):
+        config = shipped(
+            "realistic", trajectory__duration_s=40.0, reducer__link_friction_share=share,
+            virtual__link_friction_share=true, virtual__hysteresis_width_rad=0.0,
+            control__adaptation=Adaptation(ripple_per_motor_turn=(2.0, 10.0)),
+        )  # fmt: skip
+        motion = random_motion("reversals", 8, 0, 40.0)
+        joint = LockstepJoint(config)
+        run = run_scenario(joint, joint.constants(), "reversals", motion=motion)
+        figures = error_figures(run, 20.0, motion)
+        assert figures.fault == ""
+        found.append(float(run.state.law.adaptation.link_share))
+        rmse.append(figures.true_rmse_mrad)
+    assert found == pytest.approx([true, true], abs=0.03)
+    assert rmse[1] < 1.1 * rmse[0]
 
 
 @pytest.mark.parametrize(
