@@ -243,7 +243,7 @@ def motor_and_link_errors(
 
 SEEN_radps = 80.0  # bandwidth of that observer
 SEEN_Hz = 100.0  # of the low-pass on its speeds, behind which all else is that it is compared with
-LARGEST_SHARE = 0.4
+LARGEST_SHARE = 0.4  # unless more is configured
 TWIST_NOISE_rad = 3e-4  # of a sample: what the masses swing, and samples are not independent
 OFFSET_VARIANCE_rad2, SHARE_VARIANCE = 1e-7, 1e-2  # at first
 TWIST_DRIFT = 1e-4  # of these, that comes back in each step
@@ -294,7 +294,8 @@ def adapt_link_share(
     size = TWIST_NOISE_rad * TWIST_NOISE_rad + offset + friction_twist_rad * share
     error = (apart_rad - state.twist_offset_rad) / size
     state.twist_offset_rad += offset * error
-    state.link_share = min(max(state.link_share - share * error, 0.0), LARGEST_SHARE)
+    largest = max(LARGEST_SHARE, constants.link_friction_share)
+    state.link_share = min(max(state.link_share - share * error, 0.0), largest)
     covariance[0, 0] -= offset * offset / size
     covariance[0, 1] -= offset * share / size
     covariance[1, 0] = covariance[0, 1]
