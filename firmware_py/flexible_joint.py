@@ -31,7 +31,7 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.observers import low_pass_gain, step_velocity
+from jointctl.firmware_py.observers import BRIDGED_CYCLES, COAST_s, low_pass_gain, step_velocity
 from jointctl.firmware_py.records import (
     KNEES,
     AdaptationState,
@@ -228,7 +228,7 @@ def motor_and_link_errors(
     return motor_error, link_error
 
 
-# --- What adaptation sees of such a joint (`friction`) ---
+# --- What adaptation sees of such a joint (`friction`), with both encoders ---
 # The observer of the loop has the bandwidth that the loop bears, and its speeds are filtered as much as that needs:
 # next to it friction that changes within milliseconds is taken for something else.  Adaptation therefore has an
 # observer of its own on the momentum of both masses, whose disturbance moves nothing.
@@ -238,15 +238,18 @@ def motor_and_link_errors(
 #
 #     (y_l - q_d) - (y_m - theta_d) = expected twist - twist = offset + (share fed forward - share) C F
 #
-# with the compliance C and the friction F that is fed forward.  A Kalman filter follows both.  Hysteresis of the
-# reducer looks like friction of the other sign, and is found with it.
+# with the compliance C and the friction F that is fed forward (`feed_forward_lead_s` ahead, which at a reversal is a
+# sample of the wrong sign at most).  A Kalman filter follows both, in every tenth cycle whatever its length.  The
+# offset is a load, and what the encoders' zeros and maps leave; hysteresis of the reducer looks like friction of the
+# other sign, and is found with it.
 
 SEEN_radps = 80.0  # bandwidth of that observer
-SEEN_Hz = 100.0  # of the low-pass on its speeds, behind which all else is that it is compared with
+SEEN_Hz = 100.0  # of the low-pass on its speeds, and on what was fed forward that it is compared with
 LARGEST_SHARE = 0.4  # unless more is configured
+SHARE_USED_radps = 5.0  # with which what is found is fed forward
 TWIST_NOISE_rad = 3e-4  # of a sample: what the masses swing, and samples are not independent
 OFFSET_VARIANCE_rad2, SHARE_VARIANCE = 1e-7, 1e-2  # at first
-TWIST_DRIFT = 1e-4  # of these, that comes back in each step
+OFFSET_DRIFT, SHARE_DRIFT = 1e-3, 1e-4  # of these, that comes back in each step: a load changes sooner than a share
 
 
 @kernel
@@ -254,45 +257,46 @@ def see_motion(
     law: LawConstants, state: AdaptationState, applied_Nm: float, motor_rad: float, link_rad: float, gap_cycles: int
 ) -> None:
     """One cycle of the observer: `applied_Nm` of the feedback alone, the errors of motor and link."""
-    if state.primed == 0:
-        state.primed = 1
-        state.motor_rate_radps = state.link_rate_radps = 0.0
-        state.integral_Nms = state.disturbance_Nm = 0.0
-        state.twist_covariance[0, 0], state.twist_covariance[1, 1] = OFFSET_VARIANCE_rad2, SHARE_VARIANCE
-        state.twist_covariance[0, 1] = state.twist_covariance[1, 0] = 0.0
-        state.motor_error_rad, state.link_error_rad = motor_rad, link_rad
+    state.seen_missing = 0 if gap_cycles > 0 else state.seen_missing + 1
+    if state.seen_primed == 0:
+        state.seen_primed = 1
+        state.seen_motor_rate_radps = state.seen_link_rate_radps = 0.0
+        state.seen_integral_Nms = state.seen_disturbance_Nm = 0.0
+        state.seen_motor_error_rad, state.seen_link_error_rad = motor_rad, link_rad
+        state.twist_offset_rad = link_rad - motor_rad
     elif gap_cycles > 0:
         interval_s, gain = gap_cycles * law.period_s, law.adaptation.seen_gain
         if gap_cycles > 1:
             gain = low_pass_gain(SEEN_Hz, interval_s)
-        state.motor_rate_radps += gain * ((motor_rad - state.motor_error_rad) / interval_s - state.motor_rate_radps)
-        state.link_rate_radps += gain * ((link_rad - state.link_error_rad) / interval_s - state.link_rate_radps)
-        state.motor_error_rad, state.link_error_rad = motor_rad, link_rad
-    momentum_Nms = law.flexible.motor_inertia_kgm2 * state.motor_rate_radps
-    momentum_Nms += law.flexible.link_inertia_kgm2 * state.link_rate_radps
-    state.integral_Nms += law.period_s * (applied_Nm - state.disturbance_Nm)
-    state.disturbance_Nm = SEEN_radps * (state.integral_Nms - momentum_Nms)
-
-
-@kernel
-def seen_disturbance_Nm(law: LawConstants, state: AdaptationState, fed_Nm: float) -> tuple[float, float, float]:
-    """(bandwidth [rad/s], disturbance [Nm], what was fed forward [Nm] as late as that is seen)."""
-    state.fed_seen_Nm += law.adaptation.seen_gain * (fed_Nm - state.fed_seen_Nm)
-    return SEEN_radps, state.disturbance_Nm, state.fed_seen_Nm
+        motor_radps = (motor_rad - state.seen_motor_error_rad) / interval_s
+        link_radps = (link_rad - state.seen_link_error_rad) / interval_s
+        state.seen_motor_rate_radps += gain * (motor_radps - state.seen_motor_rate_radps)
+        state.seen_link_rate_radps += gain * (link_radps - state.seen_link_rate_radps)
+        state.seen_motor_error_rad, state.seen_link_error_rad = motor_rad, link_rad
+    elif state.seen_missing > BRIDGED_CYCLES:  # as those of the loop, see `coast_velocity`
+        state.seen_motor_rate_radps *= 1.0 - min(law.period_s / COAST_s, 1.0)
+        state.seen_link_rate_radps *= 1.0 - min(law.period_s / COAST_s, 1.0)
+    momentum_Nms = law.flexible.motor_inertia_kgm2 * state.seen_motor_rate_radps
+    momentum_Nms += law.flexible.link_inertia_kgm2 * state.seen_link_rate_radps
+    state.seen_integral_Nms += law.period_s * (applied_Nm - state.seen_disturbance_Nm)
+    state.seen_disturbance_Nm = SEEN_radps * (state.seen_integral_Nms - momentum_Nms)
 
 
 @kernel
 def adapt_link_share(
     constants: FlexibleConstants, state: AdaptationState, friction_twist_rad: float, apart_rad: float
 ) -> None:
-    """Learn from `apart_rad`, by which link and motor are nearer than expected; with both encoders."""
-    if constants.encoders != Encoders.BOTH:
-        return
+    """Learn from `apart_rad`, by which link and motor are nearer than expected; with both encoders.
+
+    `friction_twist_rad`: by which the whole friction would twist the reducer.
+    """
     covariance = state.twist_covariance
     offset = covariance[0, 0] + covariance[0, 1] * friction_twist_rad
     share = covariance[1, 0] + covariance[1, 1] * friction_twist_rad
     size = TWIST_NOISE_rad * TWIST_NOISE_rad + offset + friction_twist_rad * share
-    error = (apart_rad - state.twist_offset_rad) / size
+    # against what is fed forward, which is on its way to what is found
+    expected_rad = state.twist_offset_rad + (state.used_link_share - state.link_share) * friction_twist_rad
+    error = (apart_rad - expected_rad) / size
     state.twist_offset_rad += offset * error
     largest = max(LARGEST_SHARE, constants.link_friction_share)
     state.link_share = min(max(state.link_share - share * error, 0.0), largest)
@@ -300,5 +304,5 @@ def adapt_link_share(
     covariance[0, 1] -= offset * share / size
     covariance[1, 0] = covariance[0, 1]
     covariance[1, 1] -= share * share / size
-    covariance[0, 0] = min(covariance[0, 0] + TWIST_DRIFT * OFFSET_VARIANCE_rad2, OFFSET_VARIANCE_rad2)
-    covariance[1, 1] = min(covariance[1, 1] + TWIST_DRIFT * SHARE_VARIANCE, SHARE_VARIANCE)
+    covariance[0, 0] = min(covariance[0, 0] + OFFSET_DRIFT * OFFSET_VARIANCE_rad2, OFFSET_VARIANCE_rad2)
+    covariance[1, 1] = min(covariance[1, 1] + SHARE_DRIFT * SHARE_VARIANCE, SHARE_VARIANCE)

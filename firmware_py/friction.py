@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.flexible_joint import sine_of_turns, value_at
+from jointctl.firmware_py.flexible_joint import SHARE_VARIANCE, OFFSET_VARIANCE_rad2, sine_of_turns, value_at
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.records import (
     ADAPTED_PARTS,
@@ -306,10 +306,12 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState, lin
     for side in range(2):
         state.weights[2 * AS_CONFIGURED + side] = 1.0
     state.fed_filtered_Nm = 0.0
-    state.primed = 0
-    state.fed_seen_Nm = 0.0
-    state.link_share = link_share
+    state.seen_primed = 0
+    state.seen_fed_Nm = 0.0
+    state.link_share = state.used_link_share = link_share
     state.twist_offset_rad = 0.0
+    state.twist_covariance[0, 0], state.twist_covariance[1, 1] = OFFSET_VARIANCE_rad2, SHARE_VARIANCE
+    state.twist_covariance[0, 1] = state.twist_covariance[1, 0] = 0.0
     state.resting = 0
     state.cycle = 0
     state.newest = 0

@@ -8,16 +8,18 @@ import math
 
 from jointctl.firmware_py.flexible_joint import (
     Reading,
+    SEEN_radps,
+    SHARE_USED_radps,
     adapt_link_share,
     desired_motor,
     motor_and_link_errors,
     reset_flexible,
     see_motion,
-    seen_disturbance_Nm,
     value_at,
 )
 from jointctl.firmware_py.friction import (
     Condition,
+    STILL_radps,
     adapt,
     adapted_bristles_Nm,
     adapted_feed_forward_Nm,
@@ -51,7 +53,7 @@ from jointctl.firmware_py.records import (
     NetworkState,
     VelocityState,
 )
-from jointctl.firmware_py.states import ControllerKind, FeedForward
+from jointctl.firmware_py.states import ControllerKind, Encoders, FeedForward
 from jointctl.firmware_py.trajectory import Repetition
 
 # --- PID on the joint's inertia, the honest baseline: no model but J ---
@@ -383,8 +385,10 @@ def _adapt(
     state.observer_torque_Nm = state.observer.disturbance_Nm
     fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
     bandwidth_radps, seen_Nm = constants.observer.bandwidth_radps, state.observer_torque_Nm
-    if constants.kind == ControllerKind.FLEXIBLE_JOINT:
-        bandwidth_radps, seen_Nm, fed_Nm = seen_disturbance_Nm(constants, state.adaptation, fed_Nm)
+    seen = state.adaptation
+    if seen.seen_primed != 0:
+        seen.seen_fed_Nm += constants.adaptation.seen_gain * (fed_Nm - seen.seen_fed_Nm)
+        bandwidth_radps, seen_Nm, fed_Nm = SEEN_radps, seen.seen_disturbance_Nm, seen.seen_fed_Nm
     adapt(
         constants, state.adaptation, bandwidth_radps, seen_Nm, fed_Nm, desired_radps, position_rad,
         desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
@@ -518,7 +522,8 @@ def _link_friction(constants: LawConstants, state: LawState, link_radps: float, 
     own.whole_friction_Nm = state.friction_torque_Nm
     if constants.adaptation.enabled != 0:
         seen = state.adaptation
-        share = seen.link_share
+        seen.used_link_share += SHARE_USED_radps * constants.period_s * (seen.link_share - seen.used_link_share)
+        share = seen.used_link_share
         own.whole_friction_Nm = adapted_bristles_Nm(constants, seen, seen.link_deflection_rad, link_radps, condition)
     elif constants.feed_forward == FeedForward.LUGRE_DESIRED:
         own.link_deflection_rad, own.whole_friction_Nm = step_lugre(
@@ -570,11 +575,14 @@ def step_flexible_law(
     if constants.adaptation.enabled != 0:
         known_Nm -= state.friction_torque_Nm
         moving_radps = own.target_radps if reference.velocity_radps != 0.0 else 0.0
-        at_work_Nm, seen = torque_at_work_Nm(constants.observer, state.observer), state.adaptation
-        see_motion(constants, seen, at_work_Nm, motor_rad, link_rad, reading.gap_cycles)
-        if moving_radps != 0.0 and seen.cycle == 0:
-            adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
-        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, seen.motor_rate_radps, transmitted_Nm)
+        rate_seen_radps = rate_radps
+        if flexible.encoders == Encoders.BOTH:
+            seen, at_work_Nm = state.adaptation, torque_at_work_Nm(constants.observer, state.observer)
+            see_motion(constants, seen, at_work_Nm, motor_rad, link_rad, reading.gap_cycles)
+            rate_seen_radps = seen.seen_motor_rate_radps
+            if reading.gap_cycles > 0 and seen.cycle == 0 and abs(moving_radps) >= STILL_radps:
+                adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
+        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, rate_seen_radps, transmitted_Nm)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

@@ -109,17 +109,19 @@ class AdaptationState:
     rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
     resting: i4
     cycle: i4
-    # of a joint that is not rigid, see `flexible_joint`
-    primed: i4
-    motor_error_rad: f8  # of the sample before, as the next
-    link_error_rad: f8
-    motor_rate_radps: f8  # how fast they change
-    link_rate_radps: f8
-    integral_Nms: f8  # of the observer
-    disturbance_Nm: f8
-    fed_seen_Nm: f8  # what is fed forward, behind the same low-pass as the speeds
+    # of a joint that is not rigid with both encoders, see `flexible_joint`
+    seen_primed: i4
+    seen_missing: i4  # samples since the last one
+    seen_motor_error_rad: f8  # in the sample before
+    seen_link_error_rad: f8  # in the sample before
+    seen_motor_rate_radps: f8  # how fast the motor's error changes
+    seen_link_rate_radps: f8
+    seen_integral_Nms: f8  # of the observer
+    seen_disturbance_Nm: f8
+    seen_fed_Nm: f8  # what was fed forward, behind the low-pass of its speeds
     link_deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # on the link's side, as desired
-    link_share: f8  # of the friction, that the reducer transmits
+    link_share: f8  # of the friction that the reducer transmits, as found
+    used_link_share: f8  # as fed forward, which comes after
     twist_offset_rad: f8  # of the twist, that is no friction
     twist_covariance: Annotated[np.ndarray, array_of(f8, 2, 2)]  # of offset and share
 

@@ -90,6 +90,16 @@ class _Judged:
         missed = max(self.s - LARGEST_S, 0.0) + max(self.s_anywhere - LARGEST_S_ANYWHERE, 0.0) + self.beyond
         return math.log(self.error) + PENALTY * (missed + max(self.noise_Nm / LARGEST_NOISE_Nm - 1.0, 0.0))
 
+    @property
+    def kept(self) -> bool:
+        """Whether the constraints are, but for where the search ends."""
+        shares = self.s / LARGEST_S, self.s_anywhere / LARGEST_S_ANYWHERE, self.noise_Nm / LARGEST_NOISE_Nm
+        return max(*shares, math.exp(self.beyond)) <= ROUNDED
+
+    def gain_on(self, other: _Judged) -> float:
+        """By how much the error of `other` is greater; what it misses counts where one of them misses anything."""
+        return other.error / self.error if self.kept and other.kept else math.exp(min(other.cost - self.cost, 100.0))
+
 
 def _with_gains(settings: LoopSettings, logarithms: Array) -> LoopSettings:
     """The loop with these logarithms of kv, of the observer's bandwidth and perhaps of the cut-off, to three digits."""
@@ -175,7 +185,7 @@ def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
     found = search.best_from(_START[settings.encoders])
     if settings.encoders == Encoders.BOTH and found.kv < SOFT_KV_1ps:
         filtered = search.best_from(_START_FILTERED)
-        if search.judged(found).cost - search.judged(filtered).cost > math.log(WORTH_A_FILTER):
+        if search.judged(filtered).gain_on(search.judged(found)) > WORTH_A_FILTER:
             found = filtered
     judged = search.judged(found)
     cutoff_Hz = found.cutoff_Hz if found.cutoff_Hz != settings.cutoff_Hz else None

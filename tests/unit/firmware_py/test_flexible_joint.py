@@ -381,16 +381,17 @@ def test_the_observer_of_adaptation_finds_a_torque_with_and_without_each_sample(
         time_s = 1e-3 * k
         error_rad = -0.5 * (3.0 - 1.0) / (JM + JL) * time_s * time_s
         see_motion(law, state, 1.0, error_rad, error_rad, every if k % every == 0 else 0)
-    assert state.disturbance_Nm == pytest.approx(3.0, abs=0.1 * every)
+    assert state.seen_disturbance_Nm == pytest.approx(3.0, abs=0.1 * every)
 
 
 def learn_share(law: Any, state: Any, true: float, offset_rad: float, noise_rad: float = 0.0) -> None:
-    """Reversals for 20 s, of which the regression sees every tenth millisecond."""
+    """Reversals for 20 s, of which the regression sees every tenth millisecond; what is used comes after at 5 rad/s."""
     random = np.random.default_rng(3)
     for k in range(2000):
         twist_rad = 1e-3 * math.tanh(5.0 * math.sin(0.08 * k))
-        apart_rad = (state.link_share - true) * twist_rad + offset_rad + noise_rad * random.standard_normal()
+        apart_rad = (state.used_link_share - true) * twist_rad + offset_rad + noise_rad * random.standard_normal()
         adapt_link_share(law.flexible, state, twist_rad, apart_rad)
+        state.used_link_share += 0.05 * (state.link_share - state.used_link_share)
 
 
 @pytest.mark.parametrize("true", [0.02, 0.12, 0.3])
@@ -410,9 +411,18 @@ def test_the_share_of_the_link_stays_within_its_bounds() -> None:
         assert np.all(np.isfinite(state.twist_covariance))
 
 
-@pytest.mark.parametrize("encoders", [Encoders.MOTOR, Encoders.LINK])
-def test_one_encoder_tells_no_twist(encoders: Encoders) -> None:
+def test_a_share_that_is_configured_above_its_bound_stays() -> None:
     law, state = adapting()
-    law.flexible.encoders = encoders
-    learn_share(law, state, 0.3, 0.0)
-    assert state.link_share == 0.12
+    law.flexible.link_friction_share = 0.6
+    reset_adaptation(law.adaptation, state, 0.6)
+    learn_share(law, state, 0.6, 0.0)
+    assert state.link_share == pytest.approx(0.6, abs=1e-6)
+
+
+def test_encoders_that_are_apart_from_the_start_tell_no_share() -> None:
+    """Of 3 mrad, that no friction made, the first reading is the offset."""
+    law, state = adapting()
+    see_motion(law, state, 0.0, 0.0, 3e-3, 1)
+    for k in range(200):
+        adapt_link_share(law.flexible, state, 1e-3, 3e-3)
+        assert state.link_share == pytest.approx(0.12, abs=1e-9), k

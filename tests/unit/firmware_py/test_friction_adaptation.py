@@ -25,6 +25,7 @@ from jointctl.firmware_py.friction import (
 )
 from jointctl.firmware_py.records import BRISTLES, AdaptationState, LawConstants, LuGreConstants
 from jointctl.firmware_py.schema import new
+from jointctl.hil.faults import FaultKind, no_faults
 from jointctl.tools.configuration.config import Adaptation
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
@@ -32,6 +33,7 @@ from jointctl.tools.experiments.controllers import Controller, changed, controll
 from jointctl.tools.experiments.scenarios import error_figures, random_motion, run_scenario
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import shipped, written
+from tests.made_faults import one_fault
 
 RATIO, ORDER = 121.0, 2.0
 
@@ -218,6 +220,22 @@ def test_a_share_of_the_link_that_is_wrong_is_found_by_the_twist(believed: float
         rmse.append(figures.true_rmse_mrad)
     assert found == pytest.approx([true, true], abs=0.03)
     assert rmse[1] < 1.1 * rmse[0]
+
+
+@pytest.mark.parametrize(("duration_s", "share"), [(0.02, 1.0), (4.0, 0.3)])
+def test_samples_that_are_lost_teach_a_soft_joint_nothing_wrong(duration_s: float, share: float) -> None:
+    """20 ms without any, and 4 s with 70 %: the joint goes on, and follows afterwards as it did before."""
+    adaptation = Adaptation(ripple_per_motor_turn=(2.0, 10.0))
+    joint = LockstepJoint(shipped("realistic", trajectory__duration_s=30.0, control__adaptation=adaptation))
+    rmse_mrad, found = [], []
+    for faults in (no_faults(), one_fault(FaultKind.TPDO_LOST, 12.0, duration_s, share)):
+        run = joint.run_with_faults(faults)
+        assert run.fault == 0
+        late = np.flatnonzero(run.tracking)[20_000:]
+        rmse_mrad.append(1e3 * float(np.sqrt(np.mean(run.true_error_rad[late] ** 2))))
+        found.append(float(run.state.law.adaptation.link_share))
+    assert found[1] == pytest.approx(found[0], abs=0.02)
+    assert rmse_mrad[1] < 1.3 * rmse_mrad[0]
 
 
 @pytest.mark.parametrize(
