@@ -29,7 +29,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.flexible_joint import SHARE_VARIANCE, OFFSET_VARIANCE_rad2, sine_of_turns, value_at
+from jointctl.firmware_py.flexible_joint import (
+    SHARE_VARIANCE,
+    OFFSET_VARIANCE_rad2,
+    SEEN_radps,
+    sine_of_turns,
+    value_at,
+)
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.records import (
     ADAPTED_PARTS,
@@ -398,7 +404,6 @@ def fed_before_Nm(law: LawConstants, state: AdaptationState, fed_Nm: float) -> f
 def adapt(
     law: LawConstants,
     state: AdaptationState,
-    bandwidth_radps: float,
     explained_Nm: float,
     fed_Nm: float,
     desired_radps: float,
@@ -408,11 +413,12 @@ def adapt(
 ) -> None:
     """Learn from one cycle.
 
-    `explained_Nm` is the disturbance that an observer of that bandwidth has found, `fed_Nm` all that was fed forward
-    and that it is to leave; position and velocity are the measured ones, of the motor / n.
+    `explained_Nm` is the disturbance that the observer has found, of a joint that is not rigid that of its own,
+    `fed_Nm` all that was fed forward and that it is to leave; position and velocity are the measured ones, of the
+    motor / n.
     """
     constants = law.adaptation
-    share = bandwidth_radps * law.period_s
+    share = law.period_s * (SEEN_radps if state.seen_primed != 0 else law.observer.bandwidth_radps)
     sliding_Nm = 0.0
     if velocity_radps != 0.0:
         sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)

@@ -8,7 +8,6 @@ import math
 
 from jointctl.firmware_py.flexible_joint import (
     Reading,
-    SEEN_radps,
     SHARE_USED_radps,
     adapt_link_share,
     desired_motor,
@@ -384,13 +383,12 @@ def _adapt(
     add_to_disturbance(constants.observer, state.observer, -taken_Nm)
     state.observer_torque_Nm = state.observer.disturbance_Nm
     fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
-    bandwidth_radps, seen_Nm = constants.observer.bandwidth_radps, state.observer_torque_Nm
-    seen = state.adaptation
+    seen, seen_Nm = state.adaptation, state.observer_torque_Nm
     if seen.seen_primed != 0:
         seen.seen_fed_Nm += constants.adaptation.seen_gain * (fed_Nm - seen.seen_fed_Nm)
-        bandwidth_radps, seen_Nm, fed_Nm = SEEN_radps, seen.seen_disturbance_Nm, seen.seen_fed_Nm
+        seen_Nm, fed_Nm = seen.seen_disturbance_Nm, seen.seen_fed_Nm
     adapt(
-        constants, state.adaptation, bandwidth_radps, seen_Nm, fed_Nm, desired_radps, position_rad,
+        constants, state.adaptation, seen_Nm, fed_Nm, desired_radps, position_rad,
         desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
     )  # fmt: skip
 

@@ -84,7 +84,7 @@ def follow(law: Any, state: Any, truth: Truth, duration_s: float) -> np.ndarray:
         true_Nm = truth.torque_Nm(position, velocity)
         fed_Nm = adapted_feed_forward_Nm(law, state, position, velocity)
         left.append(true_Nm - fed_Nm)
-        adapt(law, state, 60.0, seen_Nm, fed_Nm, velocity, position, velocity)
+        adapt(law, state, seen_Nm, fed_Nm, velocity, position, velocity)
         seen_Nm += 60.0 * 1e-3 * (left[-1] - seen_Nm)
     return np.array(left)
 
@@ -121,7 +121,7 @@ def test_no_torque_takes_the_weights_beyond_their_bounds(law: Any) -> None:
         velocity = 0.2 * math.cos(0.01 * k)
         torque = float(random.choice([-500.0, 0.0, 500.0]))
         fed_Nm = adapted_feed_forward_Nm(law, state, 0.1, velocity)
-        adapt(law, state, 60.0, torque, fed_Nm, velocity, 0.1, velocity)
+        adapt(law, state, torque, fed_Nm, velocity, 0.1, velocity)
         friction = state.weights[: 2 * BRISTLES]
         assert np.all((friction >= 0.0) & (friction <= MOST + law.adaptation.reach))
         for side in (0, 1):
@@ -134,7 +134,7 @@ def test_nothing_adapts_while_the_desired_motion_rests(law: Any) -> None:
     follow(law, state, Truth(law, 8e4, (1.0, 1.0), 0.0), 1.0)
     before = state.weights.copy()
     for _ in range(1000):
-        adapt(law, state, 60.0, 20.0, 0.0, 0.0, 0.1, 0.01)
+        adapt(law, state, 20.0, 0.0, 0.0, 0.1, 0.01)
     assert np.array_equal(state.weights, before)
 
 
