@@ -93,6 +93,9 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
             coast_velocity(constants.velocity, state.velocity, radps, elapsed_cycles)
             coast_velocity(flexible.motor_velocity, own.motor_velocity, radps, elapsed_cycles)
             coast_velocity(flexible.link_velocity, own.link_velocity, radps, elapsed_cycles)
+            seen, adapting = constants.law.adaptation.seen, state.law.adaptation
+            coast_velocity(seen, adapting.seen_motor, radps, elapsed_cycles)
+            coast_velocity(seen, adapting.seen_link, radps, elapsed_cycles)
         moved_rad = state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
         state.measured_position_rad += moved_rad
         state.second_position_rad += moved_rad

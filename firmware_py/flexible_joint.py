@@ -31,7 +31,7 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.observers import BRIDGED_CYCLES, COAST_s, low_pass_gain, step_velocity
+from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import (
     KNEES,
     AdaptationState,
@@ -257,27 +257,15 @@ def see_motion(
     law: LawConstants, state: AdaptationState, applied_Nm: float, motor_rad: float, link_rad: float, gap_cycles: int
 ) -> None:
     """One cycle of the observer: `applied_Nm` of the feedback alone, the errors of motor and link."""
-    state.seen_missing = 0 if gap_cycles > 0 else state.seen_missing + 1
-    if state.seen_primed == 0:
-        state.seen_primed = 1
-        state.seen_motor_rate_radps = state.seen_link_rate_radps = 0.0
+    if state.seen_motor.primed == 0:
         state.seen_integral_Nms = state.seen_disturbance_Nm = 0.0
-        state.seen_motor_error_rad, state.seen_link_error_rad = motor_rad, link_rad
         state.twist_offset_rad = link_rad - motor_rad
-    elif gap_cycles > 0:
-        interval_s, gain = gap_cycles * law.period_s, law.adaptation.seen_gain
-        if gap_cycles > 1:
-            gain = low_pass_gain(SEEN_Hz, interval_s)
-        motor_radps = (motor_rad - state.seen_motor_error_rad) / interval_s
-        link_radps = (link_rad - state.seen_link_error_rad) / interval_s
-        state.seen_motor_rate_radps += gain * (motor_radps - state.seen_motor_rate_radps)
-        state.seen_link_rate_radps += gain * (link_radps - state.seen_link_rate_radps)
-        state.seen_motor_error_rad, state.seen_link_error_rad = motor_rad, link_rad
-    elif state.seen_missing > BRIDGED_CYCLES:  # as those of the loop, see `coast_velocity`
-        state.seen_motor_rate_radps *= 1.0 - min(law.period_s / COAST_s, 1.0)
-        state.seen_link_rate_radps *= 1.0 - min(law.period_s / COAST_s, 1.0)
-    momentum_Nms = law.flexible.motor_inertia_kgm2 * state.seen_motor_rate_radps
-    momentum_Nms += law.flexible.link_inertia_kgm2 * state.seen_link_rate_radps
+    if gap_cycles > 0 or state.seen_motor.primed == 0:
+        gap = max(gap_cycles, 1)
+        step_velocity(law.adaptation.seen, state.seen_motor, motor_rad, motor_rad, gap)
+        step_velocity(law.adaptation.seen, state.seen_link, link_rad, link_rad, gap)
+    momentum_Nms = law.flexible.motor_inertia_kgm2 * state.seen_motor.error_rate_radps
+    momentum_Nms += law.flexible.link_inertia_kgm2 * state.seen_link.error_rate_radps
     state.seen_integral_Nms += law.period_s * (applied_Nm - state.seen_disturbance_Nm)
     state.seen_disturbance_Nm = SEEN_radps * (state.seen_integral_Nms - momentum_Nms)
 

@@ -312,7 +312,7 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState, lin
     for side in range(2):
         state.weights[2 * AS_CONFIGURED + side] = 1.0
     state.fed_filtered_Nm = 0.0
-    state.seen_primed = 0
+    state.seen_motor.primed = state.seen_link.primed = 0
     state.seen_fed_Nm = 0.0
     state.link_share = state.used_link_share = link_share
     state.twist_offset_rad = 0.0
@@ -418,7 +418,7 @@ def adapt(
     motor / n.
     """
     constants = law.adaptation
-    share = law.period_s * (SEEN_radps if state.seen_primed != 0 else law.observer.bandwidth_radps)
+    share = law.period_s * (SEEN_radps if state.seen_motor.primed != 0 else law.observer.bandwidth_radps)
     sliding_Nm = 0.0
     if velocity_radps != 0.0:
         sliding_Nm = sliding_torque_Nm(law.friction, law.reduction_ratio, velocity_radps, condition)

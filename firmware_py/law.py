@@ -384,8 +384,8 @@ def _adapt(
     state.observer_torque_Nm = state.observer.disturbance_Nm
     fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
     seen, seen_Nm = state.adaptation, state.observer_torque_Nm
-    if seen.seen_primed != 0:
-        seen.seen_fed_Nm += constants.adaptation.seen_gain * (fed_Nm - seen.seen_fed_Nm)
+    if seen.seen_motor.primed != 0:
+        seen.seen_fed_Nm += constants.adaptation.seen.period_gain * (fed_Nm - seen.seen_fed_Nm)
         seen_Nm, fed_Nm = seen.seen_disturbance_Nm, seen.seen_fed_Nm
     adapt(
         constants, state.adaptation, seen_Nm, fed_Nm, desired_radps, position_rad,
@@ -577,7 +577,7 @@ def step_flexible_law(
         if flexible.encoders == Encoders.BOTH:
             seen, at_work_Nm = state.adaptation, torque_at_work_Nm(constants.observer, state.observer)
             see_motion(constants, seen, at_work_Nm, motor_rad, link_rad, reading.gap_cycles)
-            rate_seen_radps = seen.seen_motor_rate_radps
+            rate_seen_radps = seen.seen_motor.error_rate_radps
             if reading.gap_cycles > 0 and seen.cycle == 0 and abs(moving_radps) >= STILL_radps:
                 adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
         _adapt(constants, state, moving_radps, own.target_rad + motor_rad, rate_seen_radps, transmitted_Nm)

@@ -81,6 +81,22 @@ class LuGreConstants:
 
 
 @record
+class VelocityConstants:
+    period_s: f8
+    cutoff_Hz: f8  # first-order low-pass on the difference quotient; 0 = none
+    period_gain: f8  # velocity.low_pass_gain(cutoff_Hz, period_s), computed once
+
+
+@record
+class VelocityState:
+    primed: i4  # 0 until the first sample
+    last_position_rad: f8
+    velocity_radps: f8
+    last_error_rad: f8
+    error_rate_radps: f8  # the filtered error rate's e'
+
+
+@record
 class AdaptationConstants:
     """See `friction`, the feed-forward that adapts."""
 
@@ -89,7 +105,7 @@ class AdaptationConstants:
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
     late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
-    seen_gain: f8  # of the low-pass on the speeds that a flexible joint is seen to have
+    seen: VelocityConstants  # of the speeds that a flexible joint is seen to have
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
     ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
@@ -110,12 +126,8 @@ class AdaptationState:
     resting: i4
     cycle: i4
     # of a joint that is not rigid with both encoders, see `flexible_joint`
-    seen_primed: i4
-    seen_missing: i4  # samples since the last one
-    seen_motor_error_rad: f8  # in the sample before
-    seen_link_error_rad: f8  # in the sample before
-    seen_motor_rate_radps: f8  # how fast the motor's error changes
-    seen_link_rate_radps: f8
+    seen_motor: VelocityState  # of whose errors the rates count
+    seen_link: VelocityState
     seen_integral_Nms: f8  # of the observer
     seen_disturbance_Nm: f8
     seen_fed_Nm: f8  # what was fed forward, behind the low-pass of its speeds
@@ -213,22 +225,6 @@ class LearningState:
     stopped: i4  # switched off for the rest of the run, because the error grew
     learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
     recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
-
-
-@record
-class VelocityConstants:
-    period_s: f8
-    cutoff_Hz: f8  # first-order low-pass on the difference quotient; 0 = none
-    period_gain: f8  # velocity.low_pass_gain(cutoff_Hz, period_s), computed once
-
-
-@record
-class VelocityState:
-    primed: i4  # 0 until the first sample
-    last_position_rad: f8
-    velocity_radps: f8
-    last_error_rad: f8
-    error_rate_radps: f8  # the filtered error rate's e'
 
 
 @record

@@ -219,7 +219,7 @@ def _feed_forward_lead_s(config: Config) -> float:
 def _fill_adaptation(record: AdaptationConstants, config: Config, adaptation: Adaptation) -> None:
     ratio = config.joint.reduction_ratio
     record.enabled = 1
-    record.seen_gain = plain(low_pass_gain)(SEEN_Hz, period_s(config))
+    _fill_velocity(record.seen, config, SEEN_Hz)
     _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
     record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
     record.ripples = len(adaptation.ripple_per_motor_turn)

@@ -367,7 +367,8 @@ def adapting() -> tuple[Any, Any]:
     constants = flexible_law()[0]
     law = constants[0]
     law.period_s = 1e-3
-    law.adaptation.seen_gain = low_pass_gain(SEEN_Hz, law.period_s)
+    seen = law.adaptation.seen
+    seen.period_s, seen.cutoff_Hz, seen.period_gain = 1e-3, SEEN_Hz, low_pass_gain(SEEN_Hz, 1e-3)
     state = new(AdaptationState)
     reset_adaptation(law.adaptation, state[0], 0.12)
     return law, state[0]
