@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -72,6 +73,16 @@ class Started:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
+
+
+def processes_in(folder: Path) -> list[int]:
+    """Process ids of all whose working directory is there."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # ended in the meantime, or somebody else's
+            if (entry / "cwd").readlink() == folder.resolve():
+                found.append(int(entry.name))
+    return found
 
 
 class Bench:
@@ -164,6 +175,14 @@ class Bench:
         return read_run_log(max(self.folder.glob("runs/*.mcap"), key=lambda path: path.stat().st_mtime_ns))
 
     def end(self) -> None:
+        """Nothing of it runs on: a loop whose supervisor is killed would go on for seconds, beside the next test."""
         with self._joints:
             for started in self._started:
                 started.end()
+            give_up_s = time.monotonic() + 10.0
+            while left := processes_in(self.folder):
+                for pid in left:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+                assert time.monotonic() < give_up_s, left
+                time.sleep(0.01)
