@@ -26,9 +26,9 @@ from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.kernel import inlined, kernel, shared
 from jointctl.firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
-from jointctl.firmware_py.safety import check_suspension, is_astray, sinks, trip
+from jointctl.firmware_py.safety import check_suspension, is_astray
 from jointctl.firmware_py.schema import INT32_MAX
-from jointctl.firmware_py.sequence import ANSWER_CYCLES, is_enabled, request_stop, write_command
+from jointctl.firmware_py.sequence import end_sinking, is_enabled, request_stop, write_command
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
@@ -239,28 +239,6 @@ def note_astray(constants: np.ndarray, states: np.ndarray) -> None:
         astray += is_astray(constants[axis].limits, states[axis])
     for axis in range(len(states)):
         states[axis].shaken = 1 if astray > is_astray(constants[axis].limits, states[axis]) else 0
-
-
-@kernel
-def end_sinking(constants: np.ndarray, states: np.ndarray, samples: np.ndarray) -> None:
-    """An enabled joint that sinks before its torque comes ends the start; the fault is that of the drive it waits for.
-
-    That is its samples where they stay away: a state that is older than an answer says nothing.
-    """
-    sinking = False
-    for axis in range(len(states)):
-        waits = states[axis].phase == AxisPhase.ENABLING and samples[axis].drive_state == DriveState.ENABLED
-        sinking = sinking or (waits and sinks(constants[axis].limits, states[axis]))
-    if not sinking:
-        return
-    for axis in range(len(states)):
-        state, sample = states[axis], samples[axis]
-        if state.phase != AxisPhase.ENABLING or is_enabled(state, sample):
-            continue
-        if state.sample_age_cycles > ANSWER_CYCLES:
-            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
-        elif sample.drive_state != DriveState.ENABLED:
-            trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 
 
 @kernel

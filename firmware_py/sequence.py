@@ -14,7 +14,7 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law
 from jointctl.firmware_py.live_change import reset_change
 from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
-from jointctl.firmware_py.safety import enter, limit_position_rad, motion_fault, react, trip
+from jointctl.firmware_py.safety import enter, limit_position_rad, motion_fault, react, sinks, trip
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from jointctl.firmware_py.stream import reset_stream
 from jointctl.firmware_py.swing import reset_swing
@@ -183,6 +183,28 @@ def step_enabling(
         return  # it waits for another one
     elif waited_too_long(state, constants.sequence.enable_max_cycles):
         trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
+
+
+@kernel
+def end_sinking(constants: np.ndarray, states: np.ndarray, samples: np.ndarray) -> None:
+    """An enabled joint that sinks before its torque comes ends the start; the fault is that of the drive it waits for.
+
+    That is its samples where they stay away: a state that is older than an answer says nothing.
+    """
+    sinking = False
+    for axis in range(len(states)):
+        waits = states[axis].phase == AxisPhase.ENABLING and samples[axis].drive_state == DriveState.ENABLED
+        sinking = sinking or (waits and sinks(constants[axis].limits, states[axis]))
+    if not sinking:
+        return
+    for axis in range(len(states)):
+        state, sample = states[axis], samples[axis]
+        if state.phase != AxisPhase.ENABLING or is_enabled(state, sample):
+            continue
+        if state.sample_age_cycles > ANSWER_CYCLES:
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
+        elif sample.drive_state != DriveState.ENABLED:
+            trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 
 
 @kernel
