@@ -4,7 +4,8 @@
                                                             and lag at the late end, link at both ends of the payload
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, and one as stiff as under
     |S| <= margin.max_sensitivity of a soft joint           a steady torque, which no hysteresis holds
-    torque noise of the encoders' counts <= a share of limits.torque_max_Nm
+    torque noise of the encoders' counts <= a share of limits.torque_max_Nm; with both encoders, as in
+                                            `flexible_gains`, at most some 0.8 Nm from cycle to cycle
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / RIPPLE_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
@@ -30,7 +31,7 @@ from scipy.optimize import minimize
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import Encoders
-from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_OBSERVER_radps
+from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_NOISE_Nm, LARGEST_OBSERVER_radps
 from jointctl.tools.analysis.linear_loop import (
     Array,
     ComplexArray,
@@ -88,6 +89,7 @@ class Law:
 
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
+    most_noise_Nm: float = math.inf
 
     def beyond(self, settings: LoopSettings) -> float:
         """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
@@ -132,6 +134,7 @@ LAWS = {
     "two_encoders": Law(
         "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
         ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        most_noise_Nm=LARGEST_NOISE_Nm,
     ),
 }  # fmt: skip
 
@@ -350,9 +353,8 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     control = _control(config, law.control())
     ready = config.model_copy(update={"control": control})
     settings, _ = loop_settings(ready)
-    goals = Goals(
-        NOISE_SHARE * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s
-    )
+    noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
+    goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s)
     search = _Search(ready, law, fit, settings)
 
     def cost(one: Judged, least_error: float | None) -> float:

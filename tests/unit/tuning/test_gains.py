@@ -70,6 +70,7 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     judged = margins(loop_settings(changed(config, control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert found.best.settings.observer_radps < 120.0
+    assert found.best.noise_Nm < 0.61  # 1.8 Nm were 3 % of this joint's torque
     assert found.control.adaptation is not None
 
 
