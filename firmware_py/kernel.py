@@ -133,6 +133,7 @@ class Kernel:
         functools.update_wrapper(self, function)
         self.py_func = function
         self._forceinline = forceinline
+        self._arguments, self._defaults = function.__code__.co_argcount, function.__defaults__ or ()
         self._dispatchers: dict[bool, Any] = {}
         self._entries: dict[tuple[Any, ...], machine_code.Entry] = {}
 
@@ -145,17 +146,18 @@ class Kernel:
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         if _here.interprets:
             return self.py_func(*arguments, **named)
+        left = self._arguments - len(arguments)
+        if named or not 0 <= left <= len(self._defaults):
+            bound = inspect.signature(self.py_func).bind(*arguments, **named)
+            bound.apply_defaults()
+            arguments = bound.args
+        elif left:
+            arguments += self._defaults[-left:]
         numbers: list[Any] = []
         form: list[Any] = []
         for each in arguments:
             machine_code.flatten(each, numbers, form)
-        entry = self._entries.get(tuple(form)) if not named else None
-        if entry is None:
-            bound = inspect.signature(self.py_func).bind(*arguments, **named)
-            bound.apply_defaults()
-            if len(bound.args) != len(arguments):
-                return self(*bound.args)
-            entry = self._entry(tuple(form), arguments)
+        entry = self._entries.get(tuple(form)) or self._entry(tuple(form), arguments)
         return entry(numbers)
 
     def bound(self, *arguments: Any) -> Callable[[], Any]:
