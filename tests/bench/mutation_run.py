@@ -31,7 +31,9 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/safety.py": ("firmware_py/axis/test_*",),
     "firmware_py/axis.py": ("firmware_py/axis/test_own_loop*", "firmware_py/axis/test_axis*"),
     "firmware_py/observers.py": ("firmware_py/axis/test_axis_*", "firmware_py/test_kalman", "firmware_py/test_law"),
-    "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
+    "firmware_py/live_change.py": (
+        "firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules", "firmware_py/axis/test_live_*",
+    ),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/network.py": (
