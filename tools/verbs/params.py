@@ -12,7 +12,7 @@ from rich.table import Table
 
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.asked_drive import NodeWithEds, subject_of
+from jointctl.tools.verbs.bench_drive import NodeWithEds, subject_of
 from jointctl.tools.verbs.verb_options import CanOptions, Verb, VerbOutput, Verbs, grouped
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import NoDeviceError
-from jointctl.tools.verbs.asked_drive import NodeOnBus
+from jointctl.tools.verbs.bench_drive import NodeOnBus
 from jointctl.tools.verbs.verb_options import VerbOutput
 
 if TYPE_CHECKING:
