@@ -10,7 +10,13 @@ from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step_law
 from jointctl.firmware_py.libc import load_acquire
-from jointctl.firmware_py.live_change import step_change, step_new_motion
+from jointctl.firmware_py.live_change import (
+    following_set_points,
+    step_change,
+    step_new_motion,
+    step_other_motion,
+    step_stream,
+)
 from jointctl.firmware_py.motion_records import MotionChange, Reference
 from jointctl.firmware_py.observers import BRIDGED_CYCLES, coast_velocity, step_velocity
 from jointctl.firmware_py.records import (
@@ -59,7 +65,6 @@ from jointctl.firmware_py.states import (
     Reaction,
     TrajectoryKind,
 )
-from jointctl.firmware_py.stream import following_set_points, step_other_motion, step_stream
 from jointctl.firmware_py.trajectory import (
     NO_REPETITION,
     Repetition,

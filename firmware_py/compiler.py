@@ -8,13 +8,18 @@ from __future__ import annotations
 import contextlib
 import enum
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jointctl.firmware_py.machine_code import MachineCode, Result, stands_alone
 
 if TYPE_CHECKING:
+    from numba.core.base import BaseContext
+    from numba.core.types import Array, Integer
+    from numba.core.typing.context import BaseContext as BaseTypingContext
+    from numba.core.typing.templates import Signature
+
     from jointctl.firmware_py.kernel import Kernel
 
 
@@ -37,7 +42,7 @@ from llvmlite import ir  # noqa: E402
 from numba.core import caching, codegen, event  # noqa: E402
 from numba.core.compiler_lock import global_compiler_lock  # noqa: E402
 from numba.core.typing import typeof  # noqa: E402
-from numba.extending import register_jitable  # noqa: E402
+from numba.extending import intrinsic, register_jitable  # noqa: E402
 from numba.np import arrayobj  # noqa: E402
 
 types: Any = numba.core.types  # half of it is typed
@@ -232,13 +237,6 @@ def type_of_external(name: str, result: str, arguments: tuple[str, ...]) -> Any:
     return types.ExternalFunction(name, getattr(types, result)(*(getattr(types, one) for one in arguments)))
 
 
-def type_of_intrinsic(intrinsic: object) -> Any:
-    from numba.core.registry import cpu_target
-
-    cpu_target.typing_context.refresh()  # it may have been made a moment ago
-    return cpu_target.typing_context.resolve_value_type(intrinsic)
-
-
 def _type_of(value: object) -> Any:
     """As `typeof`, but an enum is its number."""
     if isinstance(value, tuple):
@@ -395,3 +393,52 @@ def _flat(kinds: Any) -> Iterator[Any]:
             yield from _flat(kind.types)
         else:
             yield kind
+
+
+# --- Reading and writing of memory that numba has no word for (`firmware_py.libc`) ---
+
+
+def type_of_intrinsic(intrinsic: object) -> Any:
+    from numba.core.registry import cpu_target
+
+    cpu_target.typing_context.refresh()  # it may have been made a moment ago
+    return cpu_target.typing_context.resolve_value_type(intrinsic)
+
+
+@intrinsic
+def load_int32(typing_context: BaseTypingContext, address: Integer) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> Any:
+        pointer = builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
+        return builder.load(pointer)
+
+    return types.int32(types.uintp), generate
+
+
+@intrinsic
+def load_acquire(typing_context: BaseTypingContext, words: Array, index: Integer) -> Any:
+    """Read a shared int64 word so that nothing after it is moved before it (a plain read is hoisted)."""
+
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
+        pointer = builder.gep(array.data, [arguments[1]])
+        return builder.load_atomic(pointer, "acquire", 8)
+
+    return types.int64(words, types.int64), generate
+
+
+@intrinsic
+def store_release(typing_context: BaseTypingContext, words: Array, index: Integer, value: Integer) -> Any:
+    """Write a shared int64 word so that nothing before it is moved after it."""
+
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
+        pointer = builder.gep(array.data, [arguments[1]])
+        builder.store_atomic(arguments[2], pointer, "release", 8)
+
+    return types.void(words, types.int64, types.int64), generate

@@ -68,12 +68,7 @@ if JIT_DISABLED:
 else:
 
     def _intrinsic(name: str) -> Any:
-        def made(compiler: Any) -> Any:
-            from jointctl.firmware_py import intrinsics
-
-            return compiler.type_of_intrinsic(getattr(intrinsics, name))
-
-        return OnlyInKernels(made)
+        return OnlyInKernels(lambda compiler: compiler.type_of_intrinsic(getattr(compiler, name)))
 
     _load_int32, load_acquire, store_release = map(_intrinsic, ("load_int32", "load_acquire", "store_release"))
 

@@ -10,6 +10,7 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import load_acquire
+from jointctl.firmware_py.observers import allow_reversal, note_rest, step_swing, torque_noise
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -29,7 +30,6 @@ from jointctl.firmware_py.states import (
     Reaction,
     SetPointProblem,
 )
-from jointctl.firmware_py.swing import allow_reversal, note_rest, step_swing, torque_noise
 from jointctl.firmware_py.trajectory import cubic
 
 # Half swings in a row that are a limit cycle; on 480 runs of healthy joints 2 at most of either kind, and 6 that grew.

@@ -12,12 +12,11 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law
-from jointctl.firmware_py.live_change import reset_change
+from jointctl.firmware_py.live_change import reset_change, reset_stream
+from jointctl.firmware_py.observers import reset_swing
 from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
 from jointctl.firmware_py.safety import enter, limit_position_rad, motion_fault, react, sinks, trip
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
-from jointctl.firmware_py.stream import reset_stream
-from jointctl.firmware_py.swing import reset_swing
 from jointctl.firmware_py.trajectory import plan_approach, reference_at
 
 # The drive answers a request one cycle later at the earliest; a state older than this is not its answer.

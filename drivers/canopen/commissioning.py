@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
+from jointctl.drivers.canopen.cia import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
 from jointctl.drivers.canopen.eds import EdsFile
 from jointctl.drivers.canopen.encoder import EncoderFindings, commission_drive_object
 from jointctl.drivers.canopen.pdo import (

@@ -22,9 +22,8 @@ from typing import Annotated
 import numpy as np
 
 from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
-from jointctl.drivers.canopen import cia402
-from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.identifiers import NmtState
+from jointctl.drivers.canopen import cia
+from jointctl.drivers.canopen.cia import NmtState, State
 from jointctl.drivers.drive import HALF_WRAP, WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
@@ -48,8 +47,8 @@ IGNORED_MAX_CYCLES = 20
 ERROR_SHOWN_CYCLES = 20
 _MOST_COUNTS = 2.0**62
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
-decode_state, drive_state = kernel(cia402.state_of_word), kernel(cia402.drive_state)
-control_word = kernel(cia402.control_word)
+decode_state, drive_state = kernel(cia.state_of_word), kernel(cia.drive_state)
+control_word = kernel(cia.control_word)
 
 
 class AlignTo(IntEnum):
@@ -128,7 +127,7 @@ class CanopenPort:
     last_counts: i8  # as received, 32 bit
     counts: i8  # unwrapped
     cycle: i8
-    state: i4  # cia402.State
+    state: i4  # cia.State
     nmt_state: i4
     wake_ns: i8  # when the last cycle began
     stale: i4  # 1: what waits before SYNC answers one that is too long ago

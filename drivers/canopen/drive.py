@@ -14,11 +14,10 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
-from jointctl.drivers.canopen.cia402 import Mode
+from jointctl.drivers.canopen.cia import Mode, NmtCommand
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder import EncoderEnd
-from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import OtherControllers, new_network, receive_beside_loop, report_own_frames
 from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, new_port, start_position_rad
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import canopen
 
+from jointctl.drivers.canopen.cia import TPDO1_ID, TPDO2_ID, NmtCommand
 from jointctl.drivers.canopen.eds import read_eds
-from jointctl.drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID, NmtCommand
 from jointctl.drivers.canopen.network import send_nmt
 from jointctl.drivers.canopen.pdo import (
     COMMUNICATION_TPDO,

@@ -16,7 +16,7 @@ import can
 import canopen
 
 from jointctl.drivers.can.open import receive_only
-from jointctl.drivers.canopen.identifiers import (
+from jointctl.drivers.canopen.cia import (
     EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,

@@ -12,9 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, SecondPosition, centred
-from jointctl.drivers.canopen.identifiers import (
+from jointctl.drivers.canopen.cia import (
     EMERGENCY_ID,
     HEARTBEAT_ID,
     LAST_SYNCHRONOUS,
@@ -23,7 +21,9 @@ from jointctl.drivers.canopen.identifiers import (
     SYNC_ID,
     TPDO1_ID,
     TPDO2_ID,
+    State,
 )
+from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, SecondPosition, centred
 from jointctl.drivers.canopen.sdo import ObjectAccess, object_name, was_refused
 from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings, JointEncoderSettings
 from jointctl.drivers.errors import DeviceError

@@ -15,9 +15,8 @@ import can
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
+from jointctl.drivers.canopen.cia import ControlWord, NmtCommand, State, state_of_word
 from jointctl.drivers.canopen.eds import standard_type
-from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import new_network, send_nmt
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.drive import STOP_HINT, Approval, refuse_unless_at_rest

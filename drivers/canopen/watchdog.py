@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import canopen
 
-from jointctl.drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, NmtState
+from jointctl.drivers.canopen.cia import EMERGENCY_ID, HEARTBEAT_ID, NmtState
 from jointctl.drivers.canopen.pdo import COMMUNICATION_RPDO, DISABLED, EVENT_TIMER, IDENTIFIER, LAST_PDO, pdos_of
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
 from jointctl.drivers.canopen.settings import CanopenSettings

@@ -25,7 +25,7 @@ from typing import Annotated
 import numpy as np
 
 from jointctl.drivers.drive import WRAP, take_counts
-from jointctl.drivers.elmo.codes import (
+from jointctl.drivers.elmo.dialogue import (
     AMPLIFIER_MASK,
     CR,
     EQUALS,

@@ -9,25 +9,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from jointctl.drivers.drive import Approval, CommissioningReport, DriveIdentity, refuse_unless_at_rest
-from jointctl.drivers.elmo.codes import (
-    AMPLIFIER_MASK,
-    FAULT_LATCHED,
-    UnitMode,
-    error_text,
-    motor_fault_text,
-    motor_off_cause,
-    status_text,
-)
 from jointctl.drivers.elmo.cyclic import ElmoPort
 from jointctl.drivers.elmo.dialogue import (
+    AMPLIFIER_MASK,
+    FAULT_LATCHED,
     SAFE_ATTEMPTS,
     BytePort,
     Dialogue,
     RefusedError,
     ReplyKind,
     SerialPort,
+    UnitMode,
     changed,
     encode,
+    error_text,
+    motor_fault_text,
+    motor_off_cause,
+    status_text,
     switch_off,
 )
 from jointctl.drivers.elmo.settings import (

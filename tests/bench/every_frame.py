@@ -379,8 +379,14 @@ def new_session(kind: str, config: Config | ArmConfig, control: Control, folder:
     if kind == "run":
         plan = replace(resolve(config), log_path=log)
         return Session(plan, consent, output, control, lambda _: PhaseLines(output))
-    from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_run
-    from jointctl.tools.sweeping.meter import SweepMeter, Tolerance
+    from jointctl.tools.sweeping.carry_out import (
+        MeterDisplay,
+        SweepMeter,
+        SweepPass,
+        Tolerance,
+        config_of_sweep,
+        sweep_run,
+    )
     from jointctl.tools.sweeping.options import SweepOptions
     from jointctl.tools.sweeping.plan import make_plan
     from jointctl.tools.verbs.sweep import joint_model

@@ -30,8 +30,8 @@ import numpy as np
 
 from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.can.virtual_bus import VirtualBus
+from jointctl.drivers.canopen.cia import RPDO1_ID, SYNC_ID, TPDO1_ID
 from jointctl.drivers.canopen.cyclic import CanopenPort
-from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
 from jointctl.drivers.drive import DriveGroup
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest

@@ -30,10 +30,12 @@ UNIT_TESTS = ROOT / "tests" / "unit"
 TESTS = {  # below UNIT_TESTS
     "firmware_py/safety.py": ("firmware_py/axis/test_*",),
     "firmware_py/axis.py": ("firmware_py/axis/test_own_loop*", "firmware_py/axis/test_axis*"),
-    "firmware_py/swing.py": ("firmware_py/axis/test_axis_swing*",),
-    "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
+    "firmware_py/observers.py": ("firmware_py/axis/test_axis_*", "firmware_py/test_kalman", "firmware_py/test_law"),
+    "firmware_py/live_change.py": (
+        "firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules", "firmware_py/axis/test_live_*",
+    ),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
-    "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
+    "drivers/canopen/cia.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/network.py": (
         "drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off", "drivers/canopen/test_arm_drives",
         "drivers/canopen/test_commissioning",
@@ -56,7 +58,7 @@ TESTS = {  # below UNIT_TESTS
     "tools/session/elmo_guard.py": ("session/test_elmo_guard",),
     "tools/session/set_points.py": ("interface/test_lockstep_joint", "scoping/test_remote"),
 }  # fmt: skip
-KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
+KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia.py")
 # of processor time, the second times that of all tests: a mutant that no test notices must not count as one that hangs
 LONGEST_S, LONGEST_FACTOR = 120.0, 2.0
 LONGEST_TEST_S, LONGEST_TEST_FACTOR = 15.0, 10.0  # a test may take the sum of these, the second of its own time
@@ -81,8 +83,8 @@ ENUMERATIONS = (
     "SetPointProblem",
 )
 HOMES = {  # of enumerations that are not in firmware_py/states.py
-    "State": "drivers/canopen/cia402.py", "ControlWord": "drivers/canopen/cia402.py",
-    "NmtCommand": "drivers/canopen/identifiers.py", "NmtState": "drivers/canopen/identifiers.py",
+    "State": "drivers/canopen/cia.py", "ControlWord": "drivers/canopen/cia.py",
+    "NmtCommand": "drivers/canopen/cia.py", "NmtState": "drivers/canopen/cia.py",
 }  # fmt: skip
 
 

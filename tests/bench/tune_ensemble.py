@@ -45,6 +45,7 @@ from jointctl.hil.lockstep import TRUE_POSITION_rad  # noqa: E402
 from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
+from jointctl.tools.configuration.found_values import with_values  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.configuration.sections import Friction, Virtual  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
@@ -56,12 +57,10 @@ from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402
 from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
 from jointctl.tools.tuning import carry_out  # noqa: E402
 from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
-from jointctl.tools.tuning.excitation import ResponseMotion, ResponsePlan  # noqa: E402
-from jointctl.tools.tuning.found_values import SMALL_MOTION, values_of_fit, with_values  # noqa: E402
-from jointctl.tools.tuning.frequency_response import fourier_sums, median_of  # noqa: E402
+from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402  # noqa: E402
 from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
-from jointctl.tools.tuning.joint_fit import Estimate, JointFit  # noqa: E402
-from jointctl.tools.tuning.tune_options import TuneOptions  # noqa: E402
+from jointctl.tools.tuning.joint_fit import SMALL_MOTION, Estimate, JointFit, values_of_fit  # noqa: E402
+from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
 from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
 

@@ -17,7 +17,7 @@ import can
 import pytest
 
 from jointctl.drivers.bus_lock import lock_name, marked_processes
-from jointctl.drivers.canopen.identifiers import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
+from jointctl.drivers.canopen.cia import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.configuration.arm import load_arm
 from jointctl.tools.configuration.canopen import canopen_section

@@ -11,7 +11,7 @@ import pytest
 
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen import exchange, switch_off
-from jointctl.drivers.canopen.cia402 import ControlWord, State
+from jointctl.drivers.canopen.cia import ControlWord, State
 from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
     IGNORED_MAX_CYCLES,

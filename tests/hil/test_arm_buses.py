@@ -14,7 +14,7 @@ import can
 import numpy as np
 import pytest
 
-from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cia import State
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusHub, default_socket_path

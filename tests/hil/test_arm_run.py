@@ -17,8 +17,7 @@ import can
 import numpy as np
 import pytest
 
-from jointctl.drivers.canopen.cia402 import State, state_of_word
-from jointctl.drivers.canopen.identifiers import NmtState
+from jointctl.drivers.canopen.cia import NmtState, State, state_of_word
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.recording.run_log_reader import read_run_log
 

@@ -17,9 +17,8 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning.carry_out import Carrier
-from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
-from jointctl.tools.verbs.response import response
-from jointctl.tools.verbs.tune import tune
+from jointctl.tools.verbs.response import ResponseOptions, response
+from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_steps import Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written

@@ -22,7 +22,7 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import Motion, TerminalConsent
 from jointctl.tools.tuning.carry_out import Carried, Carrier
-from jointctl.tools.tuning.tune_options import TuneOptions
+from jointctl.tools.verbs.tune import TuneOptions
 from jointctl.tools.verbs.tune_steps import Tune
 from tests.configurations import changed, written
 

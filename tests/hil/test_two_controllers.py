@@ -10,7 +10,7 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.canopen.identifiers import SYNC_ID
+from jointctl.drivers.canopen.cia import SYNC_ID
 from tests.hil.terminal import Terminal
 
 SDO_REQUEST = 0x601  # to node 1

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import split_channel
-from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
+from jointctl.drivers.canopen.cia import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import (
     CanopenSettings,
     JointEncoderSettings,

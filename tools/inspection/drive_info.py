@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jointctl.drivers.canopen.cia402 import state_text
+from jointctl.drivers.canopen.cia import state_text
 from jointctl.tools.inspection.frame_decoder import PdoMap, PdoMaps
 from jointctl.tools.inspection.objects import (
     ABORT_OPTIONS,

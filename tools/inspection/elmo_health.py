@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from jointctl.drivers.drive import DriveIdentity
-from jointctl.drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
+from jointctl.drivers.elmo.dialogue import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import cycle_characters, highest_rate_Hz
 from jointctl.drivers.errors import BusError, JointctlError

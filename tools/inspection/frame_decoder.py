@@ -18,7 +18,7 @@ import can
 import canopen
 
 from jointctl.drivers.can.socketcan import error_frame_text
-from jointctl.drivers.canopen.identifiers import (
+from jointctl.drivers.canopen.cia import (
     EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,

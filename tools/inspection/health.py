@@ -27,7 +27,7 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from jointctl.drivers.can.socketcan import SHORT_QUEUE, link_problem, link_state, up_command
-from jointctl.drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
+from jointctl.drivers.canopen.cia import SDO_ANSWER_ID, SDO_REQUEST_ID
 from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.canopen import HIGHEST_LOAD, canopen_section, cycle_bytes
 from jointctl.tools.configuration.config import Config

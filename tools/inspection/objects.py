@@ -11,9 +11,8 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
+from jointctl.drivers.canopen.cia import LAST_SYNCHRONOUS, SUPPORTED_MODE_BIT, Mode, NmtCommand, NmtState, state_text
 from jointctl.drivers.canopen.eds import read_eds
-from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS, NmtCommand, NmtState
 from jointctl.drivers.canopen.sdo import object_name
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import require_input

@@ -18,8 +18,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from jointctl.drivers.can.open import open_python_can
 from jointctl.drivers.can.socketcan import interface_blamed
-from jointctl.drivers.canopen.cia402 import state_text
-from jointctl.drivers.canopen.identifiers import (
+from jointctl.drivers.canopen.cia import (
     EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,
@@ -27,6 +26,7 @@ from jointctl.drivers.canopen.identifiers import (
     SDO_ANSWER_ID,
     SDO_REQUEST_ID,
     SYNC_ID,
+    state_text,
 )
 from jointctl.drivers.canopen.network import new_network
 from jointctl.drivers.errors import BusError, ConfigurationError, NoDeviceError

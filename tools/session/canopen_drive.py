@@ -11,8 +11,7 @@ import numpy as np
 
 from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
-from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
-from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
+from jointctl.drivers.canopen.cia import EVENT_DRIVEN, State, state_of_word, state_text
 from jointctl.drivers.drive import Drive, DriveGroup
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram

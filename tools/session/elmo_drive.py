@@ -16,8 +16,7 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 
 from jointctl.drivers.drive import Drive
-from jointctl.drivers.elmo.codes import SERVO_ON, motor_fault_text
-from jointctl.drivers.elmo.dialogue import usb_serial_number
+from jointctl.drivers.elmo.dialogue import SERVO_ON, motor_fault_text, usb_serial_number
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import command_time_s
 from jointctl.drivers.errors import BusError, JointctlError

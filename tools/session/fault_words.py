@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jointctl.drivers.canopen.cia402 import state_text
+from jointctl.drivers.canopen.cia import state_text
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event

@@ -35,7 +35,7 @@ from jointctl.tools.recording.report_page import (
     from_terminal,
     write_verb_page,
 )
-from jointctl.tools.sweeping.meter import MeasuredPoint
+from jointctl.tools.sweeping.carry_out import MeasuredPoint
 from jointctl.tools.written_file import writing
 
 if TYPE_CHECKING:

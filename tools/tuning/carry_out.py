@@ -21,6 +21,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.found_values import Found, rounded, with_values
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
@@ -31,21 +32,22 @@ from jointctl.tools.session.fault_words import FaultText, fault_text
 from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
-from jointctl.tools.tuning.excitation import (
+from jointctl.tools.tuning.frequency_response import (
+    GOOD_COHERENCE,
     LEAST_SHARE,
+    FrequencyResponse,
     Multisine,
     ResponseMotion,
     ResponsePlan,
     config_of_response,
+    grown,
     largest_peak_Nm,
     legs_of,
     multisine,
+    response_of,
     speed_and_period,
 )
-from jointctl.tools.tuning.found_values import Found, rounded, with_values
-from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, FrequencyResponse, grown, response_of
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
-from jointctl.tools.tuning.tune_options import ResponseOptions
 
 
 class NotCarriedOut(Exception):
@@ -167,20 +169,20 @@ class ResponseTask:
         return ResponseMotion(self.config, plan, self.largest_Nm)
 
 
-def response_task(config: Config, options: ResponseOptions) -> ResponseTask:
-    """`UsageError` where the options or the limits do not fit.
+def response_task(config: Config, torque_Nm: float | None, legs: int) -> ResponseTask:
+    """`torque_Nm` at most, None: what fits the joint; `UsageError` where they or the limits do not fit.
 
     With the weak law, or with that of the configuration where the gate refuses the weak one: on a joint that is known
     to be soft, with a light motor and a long delay.
     """
-    if not LEAST_LEGS <= options.legs <= MOST_LEGS:
-        raise UsageError(f"--legs (={options.legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
-    moving = config_of_response(config, options.torque_Nm)
+    if not LEAST_LEGS <= legs <= MOST_LEGS:
+        raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
+    moving = config_of_response(config, torque_Nm)
     with contextlib.suppress(ConfigurationError):  # a law whose margins are not known: the gate says so later
         if not meets(margins(loop_settings(moving)[0]), moving.margin.min_phase_margin_deg):
-            moving = config_of_response(config, options.torque_Nm, own_law=True)
+            moving = config_of_response(config, torque_Nm, own_law=True)
     _, length_s = speed_and_period(moving)
-    return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), options.legs // 2, largest_peak_Nm(moving))
+    return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), legs // 2, largest_peak_Nm(moving))
 
 
 def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyResponse, Any, ResponsePlan]:
@@ -213,7 +215,7 @@ def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarr
 
 def require_same_joint(config: Config, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
     """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
-    task = response_task(config, ResponseOptions())
+    task = response_task(config, None, LEAST_LEGS)
     peak_Nm = min(peak_Nm, task.largest_Nm)
     inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
     _refuse_another("the response", fit.inertia_kgm2, when, inertia)

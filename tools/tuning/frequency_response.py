@@ -1,4 +1,11 @@
-"""Frequency response of a joint from a multisine run: torque command to the position of either encoder.
+"""Frequency response of a joint, torque command to the position of either encoder: its excitation, its estimate.
+
+The motion is a multisine in torque on a slow triangle, whose legs differ in speed.  The joint slides all the time,
+because friction that holds takes every resonance away.  The law that keeps it on the triangle is weak; the multisine is
+the acceleration of the reference times the inertia that is believed, so that every limit and watchdog of a run is in
+force, and a swing of the feedback is told from the excitation.  Position and velocity of the reference are those of the
+triangle alone.  Each leg holds one period of the multisine at constant speed.  Legs of other speeds have their ripple
+at other frequencies, so that a median over the legs is free of it.
 
 Of each leg's period, without its trend and under a Hann window, the Fourier sums at the lines of the multisine:
 
@@ -19,16 +26,269 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from jointctl.drivers.errors import DataError
-from jointctl.firmware_py.states import AxisPhase
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
+from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
-from jointctl.tools.tuning.excitation import ResponsePlan
+from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
+from jointctl.tools.sweeping.carry_out import approach_time_s, with_mode
+from jointctl.tools.sweeping.plan import position_margin_rad
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jointctl.tools.tuning.joint_fit import JointFit
+
+
+SPEED_radps = 0.2  # of the triangle: at 0.05 friction still hides what is looked for
+LEAST_SPEED_radps = 0.1
+SPEED_SPREAD = 0.2  # by which a pair of legs is faster or slower
+VELOCITY_SHARE = 0.4  # of limits.velocity_max_radps: the excitation adds to the speed
+ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2
+PERIOD_s, SHORT_PERIOD_s = 4.0, 2.0
+SETTLE_s = 0.6  # of a leg, before its period
+FADE_s = 0.5
+LINES = 80
+LOWEST_Hz, HIGHEST_SHARE = 1.0, 0.25  # of loop.rate_Hz
+LEAST_BINS = 2  # between two lines: the window of the analysis is that wide
+FULL_FROM_Hz = 3.0  # lines below are smaller: they would turn the motion round
+CRESTS = 200  # random phases that are tried for a low peak
+TORQUE_SHARE = 0.15  # of limits.torque_max_Nm: peak of the multisine, unless the user allows less
+LEAST_SHARE = 1.0 / 8.0  # of that peak: where it begins
+FRICTION_SPARE = 1.2  # of the static friction, which the excitation leaves room for
+
+# the weak law
+KP_ps2, KV_ps, OBSERVER_radps = 100.0, 20.0, 15.0
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """One period of a torque with a peak of 1, at the loop's rate."""
+
+    frequency_Hz: np.ndarray  # (LINES,)
+    bins: np.ndarray  # the same in whole periods
+    wave: np.ndarray  # (N,)
+
+
+def multisine(rate_Hz: float, length_s: float, seed: int = 1) -> Multisine:
+    """Lines from LOWEST_Hz to a quarter of the rate, even steps of the logarithm, phases with a low peak."""
+    samples = round(rate_Hz * length_s)
+    highest = HIGHEST_SHARE * rate_Hz
+    wanted = np.geomspace(LOWEST_Hz, highest, LINES) * length_s
+    bins = [max(round(wanted[0]), LEAST_BINS)]
+    for bin_wanted in wanted[1:]:
+        bins.append(max(round(bin_wanted), bins[-1] + LEAST_BINS))
+    kept = np.array([b for b in bins if b <= highest * length_s])
+    frequency = kept / length_s
+    size = np.minimum(1.0, frequency / FULL_FROM_Hz)
+    random = np.random.default_rng(seed)
+    best = np.zeros(samples)
+    lowest = math.inf
+    for _ in range(CRESTS):
+        spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+        spectrum[kept] = size * np.exp(1j * random.uniform(0.0, math.tau, len(kept)))
+        wave = np.fft.irfft(spectrum, samples)
+        crest = float(np.max(np.abs(wave)) / np.std(wave))
+        if crest < lowest:
+            lowest, best = crest, wave
+    return Multisine(frequency, kept, best / np.max(np.abs(best)))
+
+
+@dataclass(frozen=True)
+class Legs:
+    """Velocity of the triangle, one value a cycle, and the cycle in which the period of each leg begins."""
+
+    velocity_radps: np.ndarray  # (N,)
+    starts: np.ndarray  # (legs,)
+    width_rad: float
+
+
+def room_rad(config: Config) -> float:
+    """Width of the travel that the limits leave."""
+    limits = config.limits
+    return limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
+
+
+def _length_rad(speed_radps: float, period_s_: float, acceleration: float) -> float:
+    return speed_radps * (SETTLE_s + period_s_) + speed_radps * speed_radps / acceleration
+
+
+def speed_and_period(config: Config) -> tuple[float, float]:
+    """(speed of the triangle, period of the multisine) that the travel allows; `UsageError` where it is too short."""
+    acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
+    width = room_rad(config)
+    for length_s, least in ((PERIOD_s, 0.7 * SPEED_radps), (SHORT_PERIOD_s, LEAST_SPEED_radps)):
+        speed = min(SPEED_radps, VELOCITY_SHARE * config.limits.velocity_max_radps)
+        while speed >= least:
+            if _length_rad((1.0 + SPEED_SPREAD) * speed, length_s, acceleration) <= width:
+                return speed, length_s
+            speed *= 0.98
+    needed = _length_rad((1.0 + SPEED_SPREAD) * LEAST_SPEED_radps, SHORT_PERIOD_s, acceleration)
+    fastest = VELOCITY_SHARE * config.limits.velocity_max_radps
+    raise UsageError(
+        f"the travel (={width:.4g} rad) must be at least {needed:.3g} rad, and {VELOCITY_SHARE:g} of "
+        f"limits.velocity_max_radps (={fastest:.3g} rad/s) at least {LEAST_SPEED_radps:g}: the joint has to slide; "
+        "see limits.position_min_rad, position_max_rad"
+    )
+
+
+def legs_of(config: Config, pairs: int, seed: int = 1) -> Legs:
+    """`pairs` of legs there and back, each pair at a speed of its own."""
+    speed, length_s = speed_and_period(config)
+    acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
+    rate = config.loop.rate_Hz
+    factors = 1.0 + SPEED_SPREAD * np.linspace(-1.0, 1.0, max(pairs, 2))[:pairs]
+    np.random.default_rng(seed).shuffle(factors)
+    parts, starts, count, widths = [np.zeros(round(FADE_s * rate))], [], round(FADE_s * rate), []
+    for factor in factors:
+        top = float(factor * speed)
+        ramp = max(round(top / acceleration * rate), 1)
+        cruise = round((SETTLE_s + length_s) * rate)
+        up = top * (np.arange(ramp) + 1.0) / ramp
+        leg = np.concatenate((up, np.full(cruise, top), up[::-1] - top / ramp))
+        widths.append(float(np.sum(leg)) / rate)
+        for side in (1.0, -1.0):
+            starts.append(count + ramp + round(SETTLE_s * rate))
+            parts.append(side * leg)
+            count += len(leg)
+    parts.append(np.zeros(round(FADE_s * rate)))
+    return Legs(np.concatenate(parts), np.array(starts), max(widths))
+
+
+@dataclass(frozen=True)
+class ResponsePlan:
+    """One stage: the same triangle and multisine, at one size."""
+
+    legs: Legs
+    sine: Multisine
+    peak_Nm: float
+
+    @property
+    def samples(self) -> int:
+        """Of one period."""
+        return len(self.sine.wave)
+
+
+def excitation_table(plan: ResponsePlan, inertia_kgm2: float, step_s: float) -> np.ndarray:
+    """Rows of `reference_at`, one a cycle, which is in the middle of its row: rounding of the time changes nothing."""
+    velocity = plan.legs.velocity_radps
+    count = len(velocity)
+    position = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1])))) * step_s
+    fade = round(FADE_s / step_s)
+    size = np.minimum(1.0, np.minimum(np.arange(count), np.arange(count)[::-1]) / fade)
+    torque = plan.peak_Nm * size * np.resize(plan.sine.wave, count)
+    acceleration = np.gradient(velocity, step_s) + torque / inertia_kgm2
+    half = 0.5 * step_s
+    table = np.zeros((count + 1, 5))
+    table[:-1, 0] = (np.arange(count) - 0.5) * step_s
+    # so that position, velocity and acceleration are these in the middle
+    table[:-1, 3] = 0.5 * acceleration
+    table[:-1, 2] = velocity - acceleration * half
+    table[:-1, 1] = position - table[:-1, 2] * half - table[:-1, 3] * half * half
+    table[-1] = ((count - 0.5) * step_s, position[-1], 0.0, 0.0, 0.0)
+    return table
+
+
+def largest_peak_Nm(config: Config) -> float:
+    """Of the multisine, within limits.torque_max_Nm, which the user may have lowered; `UsageError` if there is none."""
+    limit = config.limits.torque_max_Nm
+    holds = FRICTION_SPARE * (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
+    peak = min(TORQUE_SHARE * limit, 0.5 * (limit - holds))
+    if peak < 0.01 * limit:
+        raise UsageError(
+            f"the torque (={limit:g} Nm) must be more than {holds * 1.05:.3g} Nm, what friction and gravity of the "
+            "configuration take: --torque, limits.torque_max_Nm"
+        )
+    return peak
+
+
+def config_of_response(config: Config, torque_Nm: float | None, *, own_law: bool = False) -> Config:
+    """The configuration with the torque that the user allows, and the weak law, which the motor's encoder feeds.
+
+    `own_law` of the configuration instead, without learning: for a joint that is known to be too soft for the weak one.
+    """
+    limits = config.limits
+    if torque_Nm is not None and not 0.0 < torque_Nm <= limits.torque_max_Nm:
+        raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
+    known = config.friction is not None and config.control.feed_forward != "none"
+    law: dict[str, Any] = {"learning": None, "adaptation": None, "feed_forward": "desired" if known else "none"}
+    if not own_law:
+        law |= {
+            "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
+            "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
+        }  # fmt: skip
+    config = with_mode(config, "torque")
+    update: dict[str, Any] = {"control": config.control.model_copy(update=law)}
+    if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:
+        update["limits"] = limits.model_copy(update={"torque_max_Nm": torque_Nm})
+        update["drive"] = config.drive.free_of_torque_limit()
+    config = config.model_copy(update=update)
+    return config if own_law else motor_fed(config)
+
+
+def motor_fed(config: Config) -> Config:
+    """The configuration with a law that reads the motor's encoder, where there is one beside the link's."""
+    second = config.joint_encoder
+    if second is None or config.encoder.side != "motor":
+        return config
+    return config.model_copy(update={"joint_encoder": second.model_copy(update={"law": "encoder"})})
+
+
+@dataclass(frozen=True)
+class ResponseMotion:
+    """See `session.plan.Motion`; `config` is that of `config_of_response`; later stages excite by up to `most_Nm`."""
+
+    config: Config
+    plan: ResponsePlan
+    most_Nm: float
+
+    @property
+    def table(self) -> np.ndarray:
+        return excitation_table(self.plan, self.config.joint.inertia_kgm2, period_s(self.config))
+
+    def _start_rad(self, report: CommissioningReport) -> float:
+        """Where the triangle begins: half a leg from where the joint stands, as far as the limits allow."""
+        limits, margin = self.config.limits, position_margin_rad(self.config)
+        lowest = limits.position_min_rad + margin
+        highest = limits.position_max_rad - margin - self.plan.legs.width_rad
+        return min(max(report.start_position_rad - 0.5 * self.plan.legs.width_rad, lowest), max(highest, lowest))
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        config, start_rad = self.config, self._start_rad(report)
+        table = self.table
+        table[:, 1] += start_rad
+        constants = axis_constants(config, table, start_position_rad=report.start_position_rad)
+        axis = constants[0]
+        axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
+        axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-2, 0])
+        axis.sequence.approach_s = approach_time_s(config, report.start_position_rad, start_rad)
+        return Placed(constants, table, tuple(self._envelope(report, start_rad, float(axis.sequence.approach_s))))
+
+    def require_start(self, start_position_rad: float) -> None:
+        """From everywhere within the limits."""
+
+    def _envelope(self, report: CommissioningReport, start_rad: float, approach_s: float) -> list[str]:
+        plan, config = self.plan, self.config
+        top = float(np.max(np.abs(plan.legs.velocity_radps)))
+        duration_s = len(plan.legs.velocity_radps) / config.loop.rate_Hz
+        frequency = plan.sine.frequency_Hz
+        return [
+            *joint_lines(report),
+            f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
+            f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
+            f"{top:.2f} rad/s, {duration_s:.0f} s",
+            f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
+            f"at first {plan.peak_Nm:.2f} Nm on top of what the motion takes; the same again with more while the "
+            f"coherence is low, up to {self.most_Nm:.2f} Nm, about 2 minutes in all",
+            limits_line(config.limits),
+            *remark_lines(report.remarks),
+        ]
+
+
+# --- From the legs to the response ---
 
 LEVEL = 0.95
 GOOD_COHERENCE = 0.9

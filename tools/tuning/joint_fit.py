@@ -19,7 +19,8 @@ from scipy.stats import t as student
 
 from jointctl.drivers.errors import DataError
 from jointctl.tools.analysis.linear_loop import TwoMasses
-from jointctl.tools.tuning.excitation import ResponsePlan
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.found_values import Found, rounded
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
     LEVEL,
@@ -27,6 +28,7 @@ from jointctl.tools.tuning.frequency_response import (
     Channel,
     ComplexArray,
     FrequencyResponse,
+    ResponsePlan,
 )
 
 LEAST_RELATIVE = 0.02  # of a line: what no model describes
@@ -351,3 +353,36 @@ def _fitted(columns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
     left = values - columns @ found
     variance = float(left @ left) / max(len(values) - columns.shape[1], 1)
     return found, np.sqrt(variance * np.diag(np.linalg.pinv(columns.T @ columns)))
+
+
+# --- The fit as values of a configuration ---
+
+SMALL_MOTION = 1.6  # stiffness of a small motion over that under a steady torque: hysteresis, 1.4 to 1.84
+CRITICAL_SHARE = 0.04  # of the critical damping: what is more is hysteresis, which a small motion does not have
+
+
+def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
+    """Inertia, delay, lag, and of a soft reducer its inertias, stiffness and damping."""
+
+    def found(section: str, key: str, one: Estimate, value: float | None = None) -> Found:
+        number = rounded(one.value if value is None else value)
+        return Found((section,), key, number, f"{number:g} +- {one.half:.2g}, {source}")
+
+    values = [
+        found("joint", "inertia_kgm2", fit.inertia_kgm2),
+        found("margin", "loop_delay_s", fit.delay_s, max(fit.delay_s.value, 0.0)),
+        found("margin", "current_lag_s", fit.lag_s, max(fit.lag_s.value, 0.0)),
+    ]
+    if not fit.flexible:
+        return values
+    joint = fit.joint()
+    values.append(found("reducer", "motor_inertia_kgm2", fit.link_kgm2, joint.motor_kgm2))
+    values.append(found("reducer", "loop_stiffness_Nmprad", fit.stiffness_Nmprad))
+    if config.reducer is None:
+        steady = rounded(fit.stiffness_Nmprad.value / SMALL_MOTION)
+        remark = f"{steady:g}, loop_stiffness_Nmprad / {SMALL_MOTION:g}: not measured"
+        values.append(Found(("reducer",), "stiffness_Nmprad", steady, remark))
+    reduced = joint.motor_kgm2 * joint.link_kgm2 / (joint.motor_kgm2 + joint.link_kgm2)
+    damping = min(joint.damping_Nmspr, CRITICAL_SHARE * 2.0 * (joint.stiffness_Nmprad * reduced) ** 0.5)
+    values.append(found("reducer", "damping_Nmspr", fit.damping_Nmspr, damping))
+    return values

@@ -2,7 +2,7 @@
 
 The first is its section (`tools.configuration.drive_section`), the second what a session does with it
 (`tools.session.session_drive`).  The modules of a kind are loaded when one of its methods is called: `stop` is not to
-wait for what `monitor` needs.
+wait for what `monitor` needs, nor `--help` for the configuration.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import typer
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_section import DEFAULT_KIND, KINDS, GivenPlace
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
+from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, configurations, loaded, place
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.configuration.drive_section import GivenPlace
     from jointctl.tools.inspection.health import Finding
+    from jointctl.tools.inspection.subject import Subject
     from jointctl.tools.verbs.monitor import MonitorOptions
 
 _HEADING = re.compile(r"\s*\[\s*(\w+)\s*\]\s*(#.*)?")
@@ -40,6 +44,49 @@ class Asked:
     config: Config | None
     given: GivenPlace
     eds: Path | None = None
+
+
+MaybeConfig = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[CONFIG]",
+        help="configuration; without it give the bus by -i and -c",
+        autocompletion=configurations,
+    ),
+]
+Eds = Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the node; default: the configuration's")]
+
+
+def asked_of(path: Path | None, bus: CanOptions, eds: Path | None = None) -> Asked:
+    """The configuration if one is named, else what the command line says."""
+    given = place(bus)
+    if path is None and given.port is not None:
+        raise ConfigurationError("-p needs a configuration: it tells the baud rate", "for example elmo_serial")
+    return Asked(None if path is None else loaded(path, bus), given, eds)
+
+
+def subject_of(path: Path | None, bus: CanOptions, eds: Path | None = None) -> Subject:
+    """For a verb that is for CANopen only."""
+    from jointctl.tools.verbs.canopen_bench import canopen_subject
+
+    return canopen_subject(asked_of(path, bus, eds))
+
+
+def _asked(*, config: MaybeConfig = None, bus: BusOptions, eds: Eds = None) -> Asked:
+    return asked_of(config, bus, eds)
+
+
+def _subject(*, config: MaybeConfig = None, bus: CanOptions) -> Subject:
+    return subject_of(config, bus)
+
+
+def _subject_with_eds(*, config: MaybeConfig = None, bus: CanOptions, eds: Eds = None) -> Subject:
+    return subject_of(config, bus, eds)
+
+
+AskedDrive = Annotated["Asked", _asked]
+NodeOnBus = Annotated["Subject", _subject]
+NodeWithEds = Annotated["Subject", _subject_with_eds]
 
 
 @dataclass(frozen=True)
@@ -126,6 +173,8 @@ def bench_drive(kind: str) -> BenchDrive:
 
 def bench_of(config: Config | None) -> BenchDrive:
     """Of a configuration; without one a CANopen node is meant."""
+    from jointctl.tools.configuration.drive_section import DEFAULT_KIND
+
     return bench_drive(DEFAULT_KIND if config is None else config.drive.kind)
 
 
@@ -174,6 +223,8 @@ def readable_keys(
     path: Path, given: GivenPlace | None = None, environ: Mapping[str, str] | None = None
 ) -> ReadableKeys:
     """Of a file; where it is no TOML as a whole, every line that is a key of its own."""
+    from jointctl.tools.configuration.drive_section import GivenPlace
+
     given, environ = given or GivenPlace(), os.environ if environ is None else environ
     try:
         text = read_input(path).decode("utf-8-sig", "replace")
@@ -222,6 +273,8 @@ def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[list[Stop
 
 def stop_target(path: Path, given: GivenPlace | None = None, environ: Mapping[str, str] | None = None) -> StopTarget:
     """Flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file; `ConfigurationError`: what is missing."""
+    from jointctl.tools.configuration.drive_section import DEFAULT_KIND, KINDS
+
     keys = readable_keys(path, given, environ)
     kind = keys.section("drive").get("kind", "")
     if "kind" not in keys.section("drive"):

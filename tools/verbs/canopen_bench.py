@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can, split_channel, with_options
-from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
+from jointctl.drivers.canopen.cia import HIGHEST_NODE
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import FOR_A_PORT, wrong_kind
 from jointctl.tools.configuration.sections import checked_options

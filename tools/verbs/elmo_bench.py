@@ -21,8 +21,16 @@ from typing import TYPE_CHECKING
 
 from rich.table import Column, Table
 
-from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
-from jointctl.drivers.elmo.dialogue import Dialogue, SerialPort, switch_off
+from jointctl.drivers.elmo.dialogue import (
+    CURRENT_LIMITED,
+    FAULT_LATCHED,
+    SERVO_ON,
+    Dialogue,
+    SerialPort,
+    motor_off_cause,
+    status_text,
+    switch_off,
+)
 from jointctl.drivers.elmo.settings import LARGEST_SHARE, SERIAL, highest_rate_Hz
 from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
 from jointctl.tools.configuration.config import Config

@@ -155,12 +155,11 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
 
     from jointctl.firmware_py.friction import friction_curve_Nm
     from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
+    from jointctl.tools.configuration.found_values import with_break_away, with_sliding
     from jointctl.tools.experiments.fault_scenarios import PlacedSweep, placed_sweep
     from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan
-    from jointctl.tools.tuning.carry_out import response_task
-    from jointctl.tools.tuning.excitation import SPEED_radps, motor_fed
-    from jointctl.tools.tuning.found_values import with_break_away, with_sliding
-    from jointctl.tools.tuning.tune_options import AS_IT_FITS
+    from jointctl.tools.tuning.carry_out import LEAST_LEGS, response_task
+    from jointctl.tools.tuning.frequency_response import SPEED_radps, motor_fed
 
     # what the step of the direction finds, on this joint
     static_Nm = static_friction_Nm(config) or 0.0
@@ -171,14 +170,14 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
             curve = friction_constants(config.friction, config.joint.reduction_ratio)
             at_radps = np.array([SPEED_radps, -SPEED_radps])
             sliding = config.joint.reduction_ratio * friction_curve_Nm(curve, at_radps)
-            unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0)
+            unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0, SPEED_radps)
         return placed_sweep(unknown, joint, step.strokes, start_rad)
     if step.name == "direction":
         moving = motor_fed(config)
         plan = make_plan(moving, None)
         motion = CheckMotion(config_of_check(moving, plan), plan)
     else:
-        task = response_task(unknown, AS_IT_FITS)
+        task = response_task(unknown, None, LEAST_LEGS)
         motion = task.motion(step.share * task.largest_Nm, 1)
     placed = motion.placed(replace(joint.report, start_position_rad=start_rad))
     duration_s = float(placed.constants[0].trajectory.duration_s)

@@ -246,8 +246,8 @@ def identify(
     """Fit the friction model (11) to plateaus, or to any motion; writes TOML, figures and a report beside the data."""
     # into: the section goes into it, figures and the JSON report beside the data.  Otherwise into `out`, default
     # DATA.friction.toml, and they beside it.
+    from jointctl.tools.configuration.found_values import friction_snippet, with_friction_section, write_changed
     from jointctl.tools.configuration.load import shipped_config
-    from jointctl.tools.configuration.written_sections import friction_snippet, with_friction_section, write_changed
     from jointctl.tools.drawing import png
     from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Options

@@ -9,7 +9,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.asked_drive import AskedDrive
+from jointctl.tools.verbs.bench_drive import AskedDrive, bench_of
 from jointctl.tools.verbs.verb_options import VerbOutput
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ _TITLES = {
 
 def info(asked: AskedDrive, output: VerbOutput) -> int:
     """What a drive tells about itself: identity, state, errors by name, limits, ratings, PDO mapping.  Reads only."""
-    from jointctl.tools.verbs.bench_drive import bench_of
-
     return bench_of(asked.config).info(asked, output)
 
 

@@ -125,7 +125,7 @@ def map_verb(
     """Measure kinematic error and torque ripple of the reducer: one slow motion both ways, Fourier series, picture."""
     from jointctl.tools.analysis.reducer_map import found_map, map_figure
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
-    from jointctl.tools.configuration.written_sections import with_map, write_changed
+    from jointctl.tools.configuration.found_values import with_map, write_changed
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.plan import require_terminal
 

@@ -12,7 +12,7 @@ import typer
 
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.asked_drive import AskedDrive
+from jointctl.tools.verbs.bench_drive import AskedDrive, bench_of
 from jointctl.tools.verbs.verb_options import VerbOutput
 
 if TYPE_CHECKING:
@@ -103,8 +103,6 @@ def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
 
 def monitor(asked: AskedDrive, output: VerbOutput, options: MonitorOptions) -> int:
     """The traffic of a bus in words: NMT, SYNC, heartbeats, EMCY, SDO, PDO by their mapping.  Listens only."""
-    from jointctl.tools.verbs.bench_drive import bench_of
-
     return bench_of(asked.config).monitor(asked, output, options)
 
 

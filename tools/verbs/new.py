@@ -16,8 +16,7 @@ from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, Progr
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.urdf import UrdfJoint
-    from jointctl.tools.inspection.first_arm import JointAnswers
-    from jointctl.tools.inspection.first_values import Mark, Place
+    from jointctl.tools.inspection.first_files import JointAnswers, Mark, Place
     from jointctl.tools.inspection.subject import Subject
 
 Node = Annotated[int | None, typer.Option("--node", "-t", help="CANopen node of the drive", min=1, max=127)]
@@ -66,7 +65,7 @@ def new(
     if urdf is not None or joints:
         raise UsageError("--urdf and --joints are for an arm: give --arm as well")
     from jointctl.tools.configuration.load import read_text, shipped_config
-    from jointctl.tools.inspection.first_values import filled
+    from jointctl.tools.inspection.first_files import filled
 
     source = shipped_config(shipped)
     text = read_text(source)
@@ -116,7 +115,7 @@ def _write_folder(folder: Path, files: Mapping[str, bytes], output: Output) -> N
 
 def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, ask: bool) -> int:
     """The files of an arm of one's own; what its URDF does not say is asked for, or has a default."""
-    from jointctl.tools.inspection.first_arm import ARM_FILE, first_arm, moving_joints, read_own_urdf
+    from jointctl.tools.inspection.first_files import ARM_FILE, first_arm, moving_joints, read_own_urdf
 
     if folder.exists():
         raise DataError(f"{folder}: exists already, a configuration is never overwritten")
@@ -146,8 +145,7 @@ def _require_terminal(otherwise: str) -> None:
 
 def _answers(joint: UrdfJoint, node: int, output: Output, *, ask: bool) -> JointAnswers:
     """Of one joint."""
-    from jointctl.tools.inspection.first_arm import JointAnswers, default_motor_inertia_kgm2
-    from jointctl.tools.inspection.first_values import Mark
+    from jointctl.tools.inspection.first_files import JointAnswers, Mark, default_motor_inertia_kgm2
 
     inertia_kgm2 = default_motor_inertia_kgm2(joint)
     values: dict[Place, object] = {}
@@ -164,7 +162,7 @@ def _answers(joint: UrdfJoint, node: int, output: Output, *, ask: bool) -> Joint
 def _from_drive(drive: DriveOptions, text: str, folder: Path, output: Output, *, ask: bool) -> dict[Place, object]:
     """The values that the drive and the user give."""
     from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.inspection.first_values import first_values, marks, toml_text
+    from jointctl.tools.inspection.first_files import first_values, marks, toml_text
     from jointctl.tools.inspection.subject import SdoReader, canopen_network, subject_of_flags
 
     given = GivenPlace(drive.interface, drive.channel, drive.bitrate, None, drive.node)
@@ -204,7 +202,7 @@ def _asked(
     mark: Mark, suggested: tuple[object, str] | None, output: Output, before: Mapping[Place, object]
 ) -> Iterator[tuple[Place, object]]:
     """One question, until its answer may be beside those `before`; nothing if it is left open."""
-    from jointctl.tools.inspection.first_values import checked, default_of, in_order, toml_text
+    from jointctl.tools.inspection.first_files import checked, default_of, in_order, toml_text
 
     usual = toml_text(default_of(mark.place)) if mark.optional else ""
     default = usual if suggested is None else toml_text(suggested[0])

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.asked_drive import NodeWithEds, subject_of
+from jointctl.tools.verbs.bench_drive import NodeWithEds, subject_of
 from jointctl.tools.verbs.verb_options import CanOptions, Verb, VerbOutput, Verbs, grouped
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def restore_file(
     subject: Subject, path: Path, output: Output, *, assume_yes: bool, other_device: bool = False, skip: list[int]
 ) -> int:
     """Show what would change, ask, write, read back, report; `DeviceError` if something was not taken."""
-    from jointctl.drivers.canopen.identifiers import NmtCommand
+    from jointctl.drivers.canopen.cia import NmtCommand
     from jointctl.drivers.canopen.network import OtherControllers, send_nmt
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.inspection.parameters import load_parameters, restore
@@ -159,7 +159,7 @@ def restore_file(
 
 
 def _require_off(reader: SdoReader) -> None:
-    from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+    from jointctl.drivers.canopen.cia import State, state_of_word, state_text
 
     under_power = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
     word = reader.value(0x6041)

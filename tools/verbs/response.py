@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,6 @@ import typer
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED, DataError
-from jointctl.tools.tuning.tune_options import AS_IT_FITS, ResponseOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
@@ -31,6 +31,21 @@ ROWS = (
     ("lag_s", "of it lag of the current [ms]", 1e3, ""),
 )  # fmt: skip
 OF_A_REDUCER = ("link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "loss_factor")
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """None = what fits the joint."""
+
+    torque_Nm: Annotated[
+        float | None,
+        typer.Option("--torque", metavar="NM", help="at the joint at most, friction included (limits.torque_max_Nm)"),
+    ] = None
+    legs: Annotated[int, typer.Option("--legs", help="of the triangle, each with one period of the multisine")] = 12
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
+
+
+AS_IT_FITS = ResponseOptions()
 
 
 def response(
@@ -65,7 +80,7 @@ def response(
         raise DataError(f"-o (={file}) must end in .json")
     require_png(picture, [config.path])
     require_target(file, [config.path])
-    task = response_task(config, options)
+    task = response_task(config, options.torque_Nm, options.legs)
     if not (assume_yes or dry_run or options.lockstep):
         require_terminal()
     consent = TerminalConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import NoDeviceError
-from jointctl.tools.verbs.asked_drive import NodeOnBus
+from jointctl.tools.verbs.bench_drive import NodeOnBus
 from jointctl.tools.verbs.verb_options import VerbOutput
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def scan(
     passive: Annotated[bool, typer.Option("--passive", help="only listen, ask nobody")] = False,
 ) -> int:
     """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
-    from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
+    from jointctl.drivers.canopen.cia import HIGHEST_NODE
     from jointctl.tools.inspection.subject import Ear, ask_everybody, canopen_network, describe
 
     ear = Ear()

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from jointctl.tools.session.control import Control
     from jointctl.tools.session.display import Display
     from jointctl.tools.session.fault_words import FaultText
+    from jointctl.tools.sweeping.carry_out import JointModel, MeasuredPoint
     from jointctl.tools.sweeping.data_file import SweepFile
-    from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint
     from jointctl.tools.sweeping.options import Condition, SweepPoint
     from jointctl.tools.sweeping.plan import PlanSettings
 
@@ -39,7 +39,7 @@ REVISIT_DWELL = 3.0
 
 def joint_model(config: Config, settings: PlanSettings) -> JointModel:
     from jointctl.tools.configuration.conversions import joint_rad_per_count
-    from jointctl.tools.sweeping.meter import JointModel
+    from jointctl.tools.sweeping.carry_out import JointModel
 
     return JointModel(
         config.joint.reduction_ratio, config.joint.gravity_Nm, config.joint.gravity_zero_rad,
@@ -157,9 +157,15 @@ class Sweep:
         from jointctl.tools.session.display import Displays, PhaseLines
         from jointctl.tools.session.fault_words import fault_text
         from jointctl.tools.session.session import Session
-        from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, sweep_in_lockstep, sweep_run
+        from jointctl.tools.sweeping.carry_out import (
+            MeterDisplay,
+            SweepMeter,
+            SweepPass,
+            Tolerance,
+            sweep_in_lockstep,
+            sweep_run,
+        )
         from jointctl.tools.sweeping.data_file import SweepFile
-        from jointctl.tools.sweeping.meter import SweepMeter, Tolerance
 
         config, options = self.config, self.options
         motion = self.plan.motion(points, warm_up_turns, dwell_factor)

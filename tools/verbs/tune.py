@@ -3,16 +3,38 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
-from jointctl.tools.tuning.tune_options import TUNE_ALL, TuneOptions
 from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
 
 LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders"), ("tracking", "settling", "quiet")
+
+
+@dataclass(frozen=True)
+class TuneOptions:
+    """What `tune` may do, and what it is after."""
+
+    law: Annotated[str, typer.Option("--law", help="paper, precise, two_encoders, or auto: what the joint allows")] = (
+        "auto"
+    )
+    objective: Annotated[str, typer.Option("--objective", help="tracking, settling or quiet")] = "tracking"
+    torque_Nm: Annotated[
+        float | None,
+        typer.Option("--torque", metavar="NM", help="at the joint at most, in every step (limits.torque_max_Nm)"),
+    ] = None
+    refine: Annotated[
+        bool, typer.Option("--refine", help="then a few runs with other gains of the same margins; the best stays")
+    ] = False
+    resume: Annotated[bool, typer.Option("--resume", help="go on after the last step that was done")] = False
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
+
+
+TUNE_ALL = TuneOptions()
 
 
 def tune(

@@ -24,6 +24,16 @@ from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
+from jointctl.tools.configuration.found_values import (
+    Found,
+    rounded,
+    with_break_away,
+    with_friction,
+    with_sliding,
+    with_tuned,
+    with_values,
+    without_friction,
+)
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.configuration.sections import Limits, ReducerMap
@@ -45,24 +55,13 @@ from jointctl.tools.tuning.carry_out import (
     require_same_joint,
     response_task,
 )
-from jointctl.tools.tuning.excitation import motor_fed
-from jointctl.tools.tuning.found_values import (
-    Found,
-    rounded,
-    values_of_fit,
-    with_break_away,
-    with_friction,
-    with_sliding,
-    with_tuned,
-    with_values,
-    without_friction,
-)
-from jointctl.tools.tuning.frequency_response import FrequencyResponse, from_dict
+from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
 from jointctl.tools.tuning.gains import TWO_ENCODERS, ChosenGains, choose_gains, has_both_encoders
-from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of
-from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
+from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of, values_of_fit
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
+from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
+from jointctl.tools.verbs.tune import TuneOptions
 from jointctl.tools.verbs.tune_report import write_report
 from jointctl.tools.written_file import replace_file
 
@@ -115,7 +114,7 @@ class Tune:
                     "drive": self.config.drive.free_of_torque_limit(),
                 }
             )
-        response_task(self.config, self._response_options())  # what does not fit is refused before anything moves
+        response_task(self.config, None, AS_IT_FITS.legs)  # what does not fit is refused before anything moves
 
     # --- what it will do ---
 
@@ -123,7 +122,7 @@ class Tune:
         """Every motion, in its order."""
         limits, output = self.config.limits, self.config.path
         low, high = limits.position_min_rad, limits.position_max_rad
-        task = response_task(self.config, self._response_options())
+        task = response_task(self.config, None, AS_IT_FITS.legs)
         top_radps = SWEEP_SHARE * limits.velocity_max_radps
         inside = f"{low:+.3f} .. {high:+.3f} rad"
         trajectory = self.config.trajectory.kind
@@ -138,9 +137,6 @@ class Tune:
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
             "keep the joint free and unloaded, a hand on the emergency stop",
         ]
-
-    def _response_options(self) -> ResponseOptions:
-        return ResponseOptions(lockstep=self.options.lockstep)
 
     # --- the chain ---
 
@@ -232,7 +228,7 @@ class Tune:
 
     def _step_response(self) -> dict[str, Any]:
         config = self._before_friction()
-        task = response_task(config, self._response_options())
+        task = response_task(config, None, AS_IT_FITS.legs)
         found, records, plan = measured_response(task, self.carrier)
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
@@ -258,7 +254,7 @@ class Tune:
         if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
             return config
         positive_Nm, negative_Nm = kept["sliding_Nm"]
-        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value)
+        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value, SPEED_radps)
 
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])

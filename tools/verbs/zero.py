@@ -101,7 +101,7 @@ def _with_zeros(path: Path, found: Sequence[Zero]) -> bytes:
     """The file with the new zeros, and everything else as it is; `ConfigurationError` where that cannot be."""
     from jointctl.firmware_py.input_file import parse_toml
     from jointctl.tools.configuration.load import config_of, read_document
-    from jointctl.tools.inspection.first_values import filled
+    from jointctl.tools.inspection.first_files import filled
 
     text, wanted = read_document(path)
     for each in found:

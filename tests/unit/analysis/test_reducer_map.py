@@ -17,7 +17,7 @@ from jointctl.tools.analysis.reducer_map import (
     late_torque_Nm,
     map_figure,
 )
-from jointctl.tools.configuration.written_sections import with_map
+from jointctl.tools.configuration.found_values import with_map
 
 RATIO, SPEED, MOTOR, LINK = 121.0, 0.03, 0.9, 1.2
 ERROR = {1: (1.5e-5, 0.3), 2: (2e-4, 0.6), 4: (5e-5, -1.1)}  # per motor turn: (rad, rad)

@@ -16,7 +16,7 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError, NoDeviceError, UsageError
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, read_text, shipped_config
-from jointctl.tools.inspection.first_values import checked, eds_of_identity, filled, first_values, marks
+from jointctl.tools.inspection.first_files import checked, eds_of_identity, filled, first_values, marks
 from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.device_on_bus import DeviceOnBus

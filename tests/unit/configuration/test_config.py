@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from docs.reference import models_in, rows_of, sections_of_drives
-from jointctl.drivers.elmo.codes import motor_fault_text
+from jointctl.drivers.elmo.dialogue import motor_fault_text
 from jointctl.drivers.errors import ConfigurationError, MarginError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.margin_gate import require_margin

@@ -438,7 +438,7 @@ PLAIN = (
     "firmware_py/axis/test_sweep_velocity_command", "firmware_py/axis/test_own_loop",
 )  # fmt: skip
 FULLY_COVERED = (
-    "drivers/canopen/cia402.py",
+    "drivers/canopen/cia.py",
     *(f"firmware_py/{name}.py" for name in ("safety", "sequence", "live_change", "stream")),
 )
 

@@ -14,15 +14,20 @@ import serial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.elmo.codes import (
+from jointctl.drivers.elmo.dialogue import (
+    REPLY_MAX,
+    Interpreter,
+    Reply,
+    ReplyKind,
+    encode,
     error_text,
     motor_fault_names,
     motor_fault_text,
     motor_off_cause,
+    parse_reply,
     status_text,
     unit_mode,
 )
-from jointctl.drivers.elmo.dialogue import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
 from jointctl.hil.elmo_drive import (
     MF_OVERSPEED,
     MF_POSITION_LIMIT,

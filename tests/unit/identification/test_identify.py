@@ -15,8 +15,8 @@ import tomlkit
 from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.found_values import MARK, friction_snippet, with_friction_section
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.written_sections import MARK, friction_snippet, with_friction_section
 from jointctl.tools.identification import identification
 from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options

@@ -32,8 +32,8 @@ from jointctl.tools.identification.motion_report import (
 from jointctl.tools.identification.motion_table import read_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
 from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.sweeping.carry_out import MeasuredPoint, PlateauResult
 from jointctl.tools.sweeping.data_file import SweepFile
-from jointctl.tools.sweeping.meter import MeasuredPoint, PlateauResult
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.verbs.identify import identify, motion_from
 from tests.page_figures import foreign_colours, svgs

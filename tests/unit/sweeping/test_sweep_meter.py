@@ -26,8 +26,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, read_friction_data
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.session.display import Snapshot
-from jointctl.tools.sweeping.data_file import HEADING, SweepFile
-from jointctl.tools.sweeping.meter import (
+from jointctl.tools.sweeping.carry_out import (
     BATCHES,
     LEAST_SAMPLES,
     JointModel,
@@ -41,6 +40,7 @@ from jointctl.tools.sweeping.meter import (
     sticking_share,
     without_ripple,
 )
+from jointctl.tools.sweeping.data_file import HEADING, SweepFile
 from jointctl.tools.sweeping.options import Condition, SweepOptions, SweepPoint
 from jointctl.tools.sweeping.plan import Window
 from jointctl.tools.verbs import sweep as verb

@@ -21,8 +21,13 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import elmo_section, elmo_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
-from jointctl.tools.sweeping.meter import LEAST_SAMPLES
+from jointctl.tools.sweeping.carry_out import (
+    ACCELERATION_SPARE,
+    LEAST_SAMPLES,
+    middle_rad,
+    with_mode,
+    with_tracking_law,
+)
 from jointctl.tools.sweeping.options import (
     SweepOptions,
     SweepPoint,

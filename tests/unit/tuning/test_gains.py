@@ -12,9 +12,9 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
-from jointctl.tools.tuning.found_values import MARK, Found, values_of_fit, with_tuned, with_values
+from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
 from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains, converging, steady_joints
-from jointctl.tools.tuning.joint_fit import Estimate, JointFit
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
 
@@ -152,7 +152,7 @@ def test_the_file_keeps_its_comments_and_a_second_tune_replaces_the_first() -> N
     assert "# mine" in text
     assert "# a guess" in text
     assert "[joint]  # the joint" in text
-    assert text.count(MARK) == 2
+    assert text.count(TUNED_MARK) == 2
     assert "2.0 +-" not in text
 
 

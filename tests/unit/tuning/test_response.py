@@ -20,23 +20,28 @@ from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
 from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
+from jointctl.tools.configuration.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.tuning import carry_out
 from jointctl.tools.tuning.carry_out import response_task
-from jointctl.tools.tuning.excitation import (
+from jointctl.tools.tuning.frequency_response import (
+    Channel,
+    FrequencyResponse,
     ResponsePlan,
+    SPEED_radps,
     config_of_response,
     excitation_table,
+    from_dict,
+    grown,
     largest_peak_Nm,
     legs_of,
     multisine,
+    response_of,
     room_rad,
     speed_and_period,
 )
-from jointctl.tools.tuning.found_values import with_break_away, with_sliding, without_friction
-from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
 from jointctl.tools.tuning.joint_fit import Estimate, fit_from_dict, fit_joint, fitted_again, gravity_of
-from jointctl.tools.tuning.tune_options import ResponseOptions
+from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
 
@@ -325,7 +330,7 @@ def test_before_the_friction_is_known_the_reading_is_watched_by_what_moved_the_j
 def test_after_the_response_its_friction_is_fed_forward_and_no_more(
     sliding_Nm: tuple[float, float], slope_Nmspr: float, at_radps: tuple[float, ...], fed_Nm: tuple[float, ...]
 ) -> None:
-    config = with_sliding(shipped("precise"), 20.0, sliding_Nm, slope_Nmspr)
+    config = with_sliding(shipped("precise"), 20.0, sliding_Nm, slope_Nmspr, SPEED_radps)
     assert config.friction is not None
     assert config.control.feed_forward == "desired"
     curve = friction_curve_Nm(friction_constants(config.friction, 121.0), np.array(at_radps))
@@ -339,10 +344,10 @@ def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own() -> None
         "realistic", reducer__loop_stiffness_Nmprad=5.7e4, reducer__motor_inertia_kgm2=0.43, control__kp=49.0,
         control__kv=5.7, margin__loop_delay_s=1.9e-3, margin__current_lag_s=0.95e-3,
     )  # fmt: skip
-    own = response_task(soft, ResponseOptions()).config
+    own = response_task(soft, None, AS_IT_FITS.legs).config
     assert own.control.kind == "flexible_joint"
     assert (own.control.kp, own.control.kv, own.control.learning) == (49.0, 5.7, None)
-    weak = response_task(shipped("realistic"), ResponseOptions()).config  # the twin
+    weak = response_task(shipped("realistic"), None, AS_IT_FITS.legs).config  # the twin
     assert weak.control.kind == "computed_torque_observer"
     assert weak.control.kv == 20.0
 
@@ -366,7 +371,7 @@ def test_a_stage_whose_legs_were_lost_is_measured_once_more(
 
     monkeypatch.setattr(carry_out, "response_of", response_of)
     carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=said.append))
-    task = response_task(shipped("precise"), ResponseOptions())
+    task = response_task(shipped("precise"), None, AS_IT_FITS.legs)
     with pytest.raises(DataError, match="must be at least 4") if lost == 2 else nullcontext():
         found, records, plan = carry_out._stage(task, carrier, 1.0, 2)
         assert (found, records, len(plan.legs.starts)) == ("response", "records", 4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from jointctl.drivers.canopen.cia402 import (
+from jointctl.drivers.canopen.cia import (
     SUPPORTED_MODE_BIT,
     ControlWord,
     Mode,

@@ -15,10 +15,9 @@ import can
 import pytest
 
 from jointctl.drivers.canopen import commissioning, network
-from jointctl.drivers.canopen.cia402 import ControlWord, Mode, State
+from jointctl.drivers.canopen.cia import ControlWord, Mode, NmtCommand, State
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_S, STEEP_RADPS2, wait_until_ready
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
-from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
 from jointctl.drivers.canopen.switch_off import state_of

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from jointctl.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from jointctl.drivers.canopen import exchange
-from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cia import State
 from jointctl.drivers.canopen.cyclic import (
     ERROR_SHOWN_CYCLES,
     FRAME_SLOTS,

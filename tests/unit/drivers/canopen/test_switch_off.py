@@ -15,8 +15,7 @@ import can
 import pytest
 
 from jointctl.drivers.canopen import switch_off as switch_off_module
-from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.identifiers import NmtCommand
+from jointctl.drivers.canopen.cia import NmtCommand, State
 from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
 from jointctl.drivers.drive import (
     UNTOUCHED,

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cia import State
 from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, CanopenPort, accept_frame, end_cycle
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new

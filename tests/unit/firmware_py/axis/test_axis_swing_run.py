@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from jointctl.firmware_py.observers import note_rest, reset_swing, torque_noise
 from jointctl.firmware_py.records import AxisState, Sample, Swing, SwingConstants, SwingState
 from jointctl.firmware_py.safety import ERROR_SWINGS, TORQUE_SWINGS, check_swing, take_notice, watch_rest
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Notice, Reaction
-from jointctl.firmware_py.swing import note_rest, reset_swing, torque_noise
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 SLOWEST = 300

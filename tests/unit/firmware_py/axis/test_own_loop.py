@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cia import State
 from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, SLOT_OFFSET, SLOT_RPDO, end_cycle, get_i16, get_i32
 from jointctl.drivers.canopen.pdo import PdoLayout, new_port, own_layout
 from jointctl.firmware_py.axis import command_axis, limited_target_radps, look_ahead, velocity_command_radps

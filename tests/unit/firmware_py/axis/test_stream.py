@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
+from jointctl.firmware_py.live_change import between, step_other_motion
 from jointctl.firmware_py.motion_records import ChangeKind, Reference
 from jointctl.firmware_py.records import SET_POINTS, SetPoint
 from jointctl.firmware_py.safety import reference_fault, set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from jointctl.firmware_py.states import SetPointProblem as Problem
-from jointctl.firmware_py.stream import between, step_other_motion
 from tests.axis_on_stub_joint import NewRig, Rig, assert_well, finish
 
 DELAY_ms, TIMEOUT_ms = 30, 100

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cia import State
 from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, SLOT_RPDO, end_cycle, get_i32, velocity_units
 from jointctl.drivers.canopen.pdo import new_port
 from jointctl.firmware_py.axis import limited_velocity_radps

@@ -1,10 +1,11 @@
-"""The CiA 402 power state machine, as an IntEnum and pure functions.
+"""What the standards number: the CiA 402 power state machine as an IntEnum and pure functions, and what CiA 301 fixes.
 
 States are recognised by mask and value, never by equality of the whole statusword.  The controlword for a request is
 a function of the present state alone, so that a lost frame is simply sent again.  A fault is never reset here and a
 quick stop is never left towards Operation Enabled: enabling again is a new run.
 
-Plain Python: `jointctl stop` must not wait for numba.  `cyclic` compiles what the loop needs.
+Plain Python: `jointctl stop` must not wait for numba.  `cyclic` compiles what the loop needs.  The virtual drive states
+all of these numbers by itself.
 """
 
 from __future__ import annotations
@@ -123,3 +124,43 @@ def control_word(state: int, request: int) -> ControlWord:
     if request == DriveRequest.QUICK_STOP and (state == State.OPERATION_ENABLED or state == State.QUICK_STOP_ACTIVE):
         return ControlWord.QUICK_STOP
     return ControlWord.DISABLE_VOLTAGE
+
+
+# --- CiA 301: identifiers of the predefined connection set (7.3.5), NMT ---
+# An NMT command and the state that it leads to are different numbers.
+
+# of all nodes
+NMT_ID = 0x000
+SYNC_ID = 0x080
+# to be added to the node number
+EMERGENCY_ID = 0x080
+TPDO1_ID, TPDO2_ID = 0x180, 0x280
+TPDO_IDS = (TPDO1_ID, TPDO2_ID, 0x380, 0x480)
+RPDO1_ID, RPDO2_ID = 0x200, 0x300
+RPDO_IDS = (RPDO1_ID, RPDO2_ID, 0x400, 0x500)
+SDO_ANSWER_ID, SDO_REQUEST_ID = 0x580, 0x600
+HEARTBEAT_ID = 0x700
+# of an identifier of 11 bits
+FUNCTION_MASK, NODE_MASK = 0x780, 0x07F
+HIGHEST_NODE = 127
+# transmission types of PDOs (7.5.2.35): up to the first at SYNC, from the second on at an event or on receipt
+LAST_SYNCHRONOUS, EVENT_DRIVEN = 240, 254
+
+
+class NmtCommand(IntEnum):
+    """First byte of an NMT message; the second is the node, 0 for all (7.2.8.3.1)."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class NmtState(IntEnum):
+    """The byte of a heartbeat without its highest bit (7.2.8.3.2.2)."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
