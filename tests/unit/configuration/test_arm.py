@@ -274,6 +274,12 @@ def test_entities_are_refused_in_whatever_encoding_the_file_is(folder: Path) -> 
         assert "must have no DOCTYPE and no entities" in problem(folder)
 
 
+@pytest.mark.parametrize("encoding", ["no-such", "shift_jis", "rot13"])
+def test_an_encoding_that_the_parser_does_not_know(folder: Path, encoding: str) -> None:
+    change(folder / "arm.urdf", r"^<\?xml.*?\?>", f'<?xml version="1.0" encoding="{encoding}"?>')
+    assert "arm.urdf: not valid XML: " in problem(folder)
+
+
 IN_FILES: list[tuple[str, str, str, str]] = [
     ("elbow.toml", r"node = 2", "node = 1", "elbow.toml: drive.node (=1) must differ from drive.node of shoulder.toml"),
     ("wrist.toml", r"rate_Hz = 1000.0", "rate_Hz = 500.0", "wrist.toml: loop.rate_Hz (=500) must be that of shoulder"),
