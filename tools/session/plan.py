@@ -23,6 +23,7 @@ from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import approach_start, peak_of
+from jointctl.tools.analysis.margin_gate import require_loop, require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import (
     axis_constants,
@@ -39,6 +40,8 @@ from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.written_file import file_stems
 
 if TYPE_CHECKING:
+    from jointctl.tools.analysis.arm_check import PoseRange
+    from jointctl.tools.analysis.margins import Margins
     from jointctl.tools.configuration.arm import ArmConfig
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
@@ -75,6 +78,16 @@ class JointPlan:
     motion: Motion
     log_path: Path
     name: str = ""
+    poses: PoseRange | None = None  # of a joint of an arm: what its loop must bear
+
+    def require_margin(self, delay_s: float, *, allow_low_margin: bool) -> Margins:
+        """See `margin_gate.require_margin`; of a joint of an arm over its poses."""
+        if self.poses is None:
+            return require_margin(self.config, delay_s, allow_low_margin=allow_low_margin)
+        from jointctl.tools.analysis.arm_check import joint_loop
+
+        loop = joint_loop(self.name, self.config, self.poses, delay_s)
+        return require_loop(loop.config, loop.settings, loop.margins, allow_low_margin=allow_low_margin)
 
     def lines(self, lines: Iterable[str]) -> list[str]:
         """Of its envelope, below its name where it is one of several."""
@@ -217,17 +230,18 @@ def resolve_arm(
 ) -> RunPlan:
     """The plan of a run of an arm: each joint has its part of the motion, and a log of its own.
 
-    `ConfigurationError` also where a bus cannot carry the joints on it.
+    `ConfigurationError` also where a bus cannot carry the joints on it, or a joint not the arm.
     """
-    from jointctl.tools.analysis.arm_check import require_budgets  # a single joint does not wait for it
+    from jointctl.tools.analysis.arm_check import require_budgets, require_held  # a single joint does not wait for it
 
     require_budgets(arm)
+    ranges = require_held(arm)
     named = arm.joints[0].model_copy()
     named._path = arm.path
     path = log_path(named)
     joints = []
-    for config, name, stem in zip(arm.joints, arm.names, file_stems(arm.names), strict=True):
-        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{stem}.mcap"), name))
+    for config, name, stem, poses in zip(arm.joints, arm.names, file_stems(arm.names), ranges, strict=True):
+        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{stem}.mcap"), name, poses))
     first = joints[0]
     plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, UsageError
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, MarginError, UsageError
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.drive_section import GivenPlace
@@ -49,6 +50,23 @@ def test_the_envelope_names_every_joint_and_their_common_approach(arm: ArmConfig
     assert np.all(approaches == approaches[0])  # what is shown is what the loop gets
     assert round(float(approaches[0]), 1) in shown
     assert [float(start) for start in placed.constants.sequence.start_rad] == [0.1, 0.2, -0.3]
+
+
+def test_the_gate_before_enabling_is_that_of_the_poses(arm: ArmConfig) -> None:
+    """An inertia that no pose has: alone the joint would have its margin."""
+    wrong = replace(arm, joints=(*arm.joints[:2], changed(arm.joints[2], joint__inertia_kgm2=0.4)))
+    joints = resolve_arm(wrong).joints
+    for joint in (*joints[:2], replace(joints[2], poses=None)):
+        assert joint.require_margin(0.001, allow_low_margin=False).phase_margin_deg > 35.0
+    with pytest.raises(MarginError, match=r"must be at least 30 deg: .*worst case: inertia 0\.133 kg m2"):
+        joints[2].require_margin(0.001, allow_low_margin=False)
+    assert joints[2].require_margin(0.001, allow_low_margin=True).stable
+
+
+def test_an_arm_that_a_joint_cannot_hold_is_refused_before_anything_is_sent(arm: ArmConfig) -> None:
+    weak = changed(arm.joints[0], limits__torque_max_Nm=30.0)
+    with pytest.raises(ConfigurationError, match="joint shoulder: gravity reaches 32"):
+        resolve_arm(replace(arm, joints=(weak, *arm.joints[1:])))
 
 
 def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
