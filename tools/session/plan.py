@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
-from jointctl.drivers.errors import BusError, JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from jointctl.tools.analysis.margins import Margins
     from jointctl.tools.configuration.arm import ArmConfig
 
+UNTIL_STOPPED_s = 60.0  # of a motion without an end that are looked at
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 
 
@@ -230,7 +231,7 @@ def resolve_arm(
 ) -> RunPlan:
     """The plan of a run of an arm: each joint has its part of the motion, and a log of its own.
 
-    `ConfigurationError` also where a bus cannot carry the joints on it, or a joint not the arm.
+    `ConfigurationError` also where a bus cannot carry the joints on it, or a joint not the arm in its poses and motion.
     """
     from jointctl.tools.analysis.arm_check import require_budgets, require_held  # a single joint does not wait for it
 
@@ -241,10 +242,29 @@ def resolve_arm(
     path = log_path(named)
     joints = []
     for config, name, stem, poses in zip(arm.joints, arm.names, file_stems(arm.names), ranges, strict=True):
-        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{stem}.mcap"), name, poses))
+        try:
+            own = motion(config)
+        except ConfigurationError as error:  # its [trajectory] is not that of its file
+            error.message = "\n".join(f"{arm.path}: with [motion], {line}" for line in error.message.splitlines())
+            raise
+        joints.append(JointOfArmPlan(config, own, path.with_name(f"{path.stem}.{stem}.mcap"), name, poses))
+    if motion is configured:
+        _require_torques(arm, joints)
     first = joints[0]
     plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)
+
+
+def _require_torques(arm: ArmConfig, joints: Sequence[JointPlan]) -> None:
+    """`ConfigurationError` where the arm's model asks more of a joint than its limit in the configured motion."""
+    from jointctl.tools.analysis.arm_check import require_torques
+
+    trajectories = new(TrajectoryConstants, len(joints))
+    for trajectory, joint in zip(trajectories, joints, strict=True):
+        fill_trajectory(trajectory, joint.config, joint.motion.table)
+    duration_s = joints[0].config.trajectory.duration_s or UNTIL_STOPPED_s
+    tables = stacked_tables([joint.motion.table for joint in joints])
+    require_torques(arm, trajectories, tables, duration_s, lambda: None)
 
 
 class FreeMotion:

@@ -21,7 +21,7 @@ from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_buses
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
-from jointctl.tools.session.plan import blamed, resolve_arm
+from jointctl.tools.session.plan import blamed, free, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from tests.configurations import changed
@@ -67,6 +67,42 @@ def test_an_arm_that_a_joint_cannot_hold_is_refused_before_anything_is_sent(arm:
     weak = changed(arm.joints[0], limits__torque_max_Nm=30.0)
     with pytest.raises(ConfigurationError, match="joint shoulder: gravity reaches 32"):
         resolve_arm(replace(arm, joints=(weak, *arm.joints[1:])))
+
+
+def moving(tmp_path: Path, motion: str, table: str = "") -> ArmConfig:
+    """The shipped arm with this [motion], and a table in way.csv."""
+    folder = Path(shutil.copytree(SHIPPED_ARM.parent, tmp_path / "arm"))
+    (folder / "way.csv").write_text(table)
+    text = (folder / "arm.toml").read_text()
+    (folder / "arm.toml").write_text(text[: text.index("[motion]")] + motion)
+    return load_arm(folder / "arm.toml")
+
+
+@pytest.mark.parametrize(("frequency_Hz", "duration_s", "allowed"), [
+    (11.0, 5.0, False), (11.0, 0.0, False), (4.0, 5.0, True),
+])  # fmt: skip
+def test_a_motion_that_takes_more_than_a_joints_torque_is_refused_before_anything_is_sent(
+    tmp_path: Path, frequency_Hz: float, duration_s: float, allowed: bool
+) -> None:
+    """Within all limits of position and speed."""
+    motion = f"duration_s = {duration_s}\namplitude_rad = [0.04, 0.04, 0.04]\nfrequency_Hz = [{frequency_Hz}, 0.1, 0.1]"
+    arm = moving(tmp_path, f'[motion]\nkind = "sine"\n{motion}\n')
+    resolve_arm(arm, free)  # that is not what it does there
+    if allowed:
+        resolve_arm(arm)
+    else:
+        with pytest.raises(ConfigurationError, match=r"^shoulder: the motion takes .* must be in \[-145\.\.145\]"):
+            resolve_arm(arm)
+
+
+def test_what_is_wrong_with_a_table_is_the_arms_motion_and_not_the_joints(tmp_path: Path) -> None:
+    table = "time_s,shoulder_rad,elbow_rad,wrist_rad\n0,0,0,0\n0.1,0,1,0\n2,0,0,0\n"
+    arm = moving(tmp_path, '[motion]\nkind = "table"\nduration_s = 1.0\nfile = "way.csv"\n', table)
+    with pytest.raises(ConfigurationError) as caught:
+        resolve_arm(arm)
+    lines = caught.value.message.splitlines()
+    assert len(lines) == 2
+    assert all(re.match(r".*arm\.toml: with \[motion\], .*elbow\.toml: trajectory: ", line) for line in lines)
 
 
 def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
