@@ -22,7 +22,7 @@ from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.firmware_py.trajectory import approach_start, peak_of
+from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
 from jointctl.tools.analysis.margin_gate import require_loop, require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import (
@@ -140,7 +140,8 @@ class RunPlan:
         constants = self.arm.config.connected([each.constants for each in placed])
         lines: list[str] = []
         for axis, joint, report in zip(constants, joints, reports, strict=True):
-            lines += joint.lines(joint.motion.envelope(axis, report))
+            with blamed(joint.name):
+                lines += joint.lines(joint.motion.envelope(axis, report))
         return Placed(constants, placed[0].table, tuple(lines))
 
 
@@ -328,11 +329,27 @@ class ConfiguredMotion:
             )
 
     def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
-        """Lines that say where the joint will go, how fast, with how much torque, for how long."""
-        config = self.config
+        """Lines that say where the joint will go, how fast, with how much torque, for how long.
+
+        `MotionFault` where the approach, which may swing back for the speed that the trajectory begins with, would
+        leave the limits.  The longer the farther: in an arm it takes as long as that of the slowest joint.
+        """
+        config, limits = self.config, self.config.limits
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
         first = approach_start(axis.trajectory, self.table)
         approach = float(axis.sequence.approach_s)
+        if approach:
+            way = approach_peak(report.start_position_rad, first, approach)
+            for far_rad in (way.position_min_rad, way.position_max_rad):
+                inside = limits.position_min_rad <= far_rad <= limits.position_max_rad
+                if not inside and far_rad != report.start_position_rad:  # where it stands is the loop's to judge
+                    raise MotionFault(
+                        f"the approach from {report.start_position_rad:+.4f} rad in {approach:.1f} s swings to "
+                        f"{far_rad:+.4f} rad, must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], "
+                        "the limits.position_*_rad",
+                        "begin nearer to the beginning of the motion, of an arm with all joints, or with a motion "
+                        "that begins at rest",
+                    )
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
         return [

@@ -13,7 +13,15 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, MarginError, UsageError
+from jointctl.drivers.errors import (
+    BusError,
+    ConfigurationError,
+    DeviceError,
+    JointctlError,
+    MarginError,
+    MotionFault,
+    UsageError,
+)
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.drive_section import GivenPlace
@@ -103,6 +111,17 @@ def test_what_is_wrong_with_a_table_is_the_arms_motion_and_not_the_joints(tmp_pa
     lines = caught.value.message.splitlines()
     assert len(lines) == 2
     assert all(re.match(r".*arm\.toml: with \[motion\], .*elbow\.toml: trajectory: ", line) for line in lines)
+
+
+def test_an_approach_that_swings_beyond_a_limit_is_refused_before_anything_moves(arm: ArmConfig) -> None:
+    """The wrist begins with speed, and has as long for its approach as the shoulder needs from its limit."""
+    plan = resolve_arm(arm)
+    plan.placed([report(start) for start in (1.0, 0.1, 0.1)])
+    with pytest.raises(
+        MotionFault, match=r"^wrist: the approach from \+0\.1000 rad in 5.* must be in \[-1\.9\.\.1\.9\]"
+    ):
+        plan.placed([report(start) for start in (1.39, 0.1, 0.1)])
+    plan.placed([report(start) for start in (0.1, 2.1, 0.1)])  # stands beyond its limit: that is the loop's fault
 
 
 def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
