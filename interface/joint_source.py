@@ -95,11 +95,15 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
 
 def _loaded(given: str | Path | Config | ArmConfig, kind: str) -> tuple[Config | ArmConfig, bool]:
     """The configuration, and whether it is a shipped one that was named."""
-    from jointctl.tools.configuration.arm import SHIPPED_ARM, load_joint_or_arm
+    from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_joint_or_arm
     from jointctl.tools.verbs.verb_options import config_path
 
-    if not isinstance(given, (str, Path)):
+    if isinstance(given, (Config, ArmConfig)):
         return given, False
+    if not isinstance(given, (str, Path)):
+        raise ConfigurationError(
+            f"config (={str(given)[:40]}) must be a file, a name, or a configuration that was read"
+        )
     shipped = not os.path.exists(given)
     its_own = shipped and kind == "Arm" and str(given) == SHIPPED_NAME
     return load_joint_or_arm(SHIPPED_ARM if its_own else config_path(Path(given))), shipped

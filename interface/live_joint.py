@@ -36,6 +36,7 @@ from jointctl.tools.session.set_points import load_check
 
 WHO = "the program"
 ENDED, AGAIN = "the run has ended", "begin a new Joint"
+NOT_COMMISSIONED = "the joint is not commissioned", "use it in a `with` block"
 # what takes its time to load, and is needed while the joint waits for its program
 _NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
 ANSWER_S = 2.0  # of the loop to a new motion
@@ -199,7 +200,7 @@ class LiveMotor:
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
         approval, session = self._approval, self._session
         if approval is None or session is None:
-            raise MotionFault("the joint is not commissioned", "use it in a `with` block")
+            raise MotionFault(*NOT_COMMISSIONED)
         self._raise()
         approval.answer = True if approve is None else bool(approve(approval.lines))
         approval.answered.set()
@@ -222,6 +223,8 @@ class LiveMotor:
     def newest(self) -> Newest:
         now_ns = time.monotonic_ns()
         starts_rad = tuple(motion.start_rad for motion in self._motions)
+        if not starts_rad:
+            raise MotionFault(*NOT_COMMISSIONED)
         loop = self._loop
         head = 0 if loop is None else int(loop.block.words[Word.HEAD])
         if loop is None or head == 0:

@@ -138,25 +138,25 @@ def poses(arm: ArmConfig) -> Iterator[tuple[float, ...]]:
 def pose_models(arm: ArmConfig) -> tuple[np.ndarray, np.ndarray]:
     """M, float64 (poses, N, N), and gravity's torques, (poses, N), over the grid of poses."""
     memory = arm.model.memory()
-    constants: Any = memory.constants[0]
-    motion: Any = memory.motion
-    gravity_mps2 = constants.gravity_mps2.copy()
     axes = len(arm.joints)
+    gravity_mps2 = memory.constants["gravity_mps2"][0]  # views: thousands of poses would wait for records
+    position_rad, acceleration_radps2, torque_Nm = (
+        memory.motion[name][:axes] for name in ("position_rad", "acceleration_radps2", "torque_Nm")
+    )
     inertias, loads = [], []
     for pose in poses(arm):
-        for axis, angle in enumerate(pose):
-            motion.position_rad[axis] = angle
-        constants.gravity_mps2[:] = gravity_mps2
-        motion.acceleration_radps2[:] = 0.0
+        position_rad[:] = pose
+        gravity_mps2[:] = arm.arm.gravity_mps2
+        acceleration_radps2[:] = 0.0
         newton_euler(memory)
-        loads.append(motion.torque_Nm[:axes].copy())
-        constants.gravity_mps2[:] = 0.0
+        loads.append(torque_Nm.copy())
+        gravity_mps2[:] = 0.0
         inertia = np.zeros((axes, axes))
         for axis in range(axes):
-            motion.acceleration_radps2[:] = 0.0
-            motion.acceleration_radps2[axis] = 1.0
+            acceleration_radps2[:] = 0.0
+            acceleration_radps2[axis] = 1.0
             newton_euler(memory)
-            inertia[axis] = motion.torque_Nm[:axes]
+            inertia[axis] = torque_Nm
         inertias.append(inertia)
     return np.array(inertias), np.array(loads)
 
@@ -209,6 +209,8 @@ def require_torques(
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:
     """Margins of a joint's loop with the least and the greatest inertia; of a flexible one the link's goes with it."""
     reducer, inertia = config.reducer, config.joint.inertia_kgm2
+    held = config.joint.model_copy(update={"gravity_Nm": found.gravity_Nm})  # the arm's, in the worst pose
+    config = config.model_copy(update={"joint": held})
     ends = found.least_kgm2, found.greatest_kgm2
     if reducer is not None:
         motor = reducer.motor_inertia_kgm2
@@ -222,14 +224,21 @@ def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | Non
     return JointOfArm(name, config, found, settings, margins(settings))
 
 
-def joint_loops(arm: ArmConfig, delay_s: float | None = None) -> list[JointOfArm]:
-    """One for each joint, over the poses within the limits; `ConfigurationError` where gravity exceeds the torque."""
-    loops = []
-    for name, config, found in zip(arm.names, arm.joints, pose_ranges(arm), strict=True):
+def require_held(arm: ArmConfig) -> list[PoseRange]:
+    """The ranges of the poses within the limits; `ConfigurationError` where gravity exceeds a joint's torque."""
+    ranges = pose_ranges(arm)
+    for name, config, found in zip(arm.names, arm.joints, ranges, strict=True):
         if found.gravity_Nm >= config.limits.torque_max_Nm:
             raise ConfigurationError(
                 f"{arm.path}: joint {name}: gravity reaches {found.gravity_Nm:.3g} Nm within the joints' limits, and "
                 f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more"
             )
-        loops.append(joint_loop(name, config, found, delay_s))
-    return loops
+    return ranges
+
+
+def joint_loops(arm: ArmConfig, delay_s: float | None = None) -> list[JointOfArm]:
+    """One for each joint, over the poses within the limits; `ConfigurationError` as of `require_held`."""
+    return [
+        joint_loop(name, config, found, delay_s)
+        for name, config, found in zip(arm.names, arm.joints, require_held(arm), strict=True)
+    ]

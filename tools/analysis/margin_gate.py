@@ -195,9 +195,15 @@ def require_margin(config: Config, delay_s: float | None = None, *, allow_low_ma
 
     `allow_low_margin` is the user's explicit override; it never lets an unstable loop pass.
     """
+    return require_loop(config, loop_settings(config, delay_s)[0], allow_low_margin=allow_low_margin)
+
+
+def require_loop(
+    config: Config, settings: LoopSettings, found: Margins | None = None, *, allow_low_margin: bool = False
+) -> Margins:
+    """See `require_margin`, with the loop's settings, and its margins where they are known already."""
     minimum_deg = config.margin.min_phase_margin_deg
-    settings, _ = loop_settings(config, delay_s)
-    found = margins(settings)
+    found = margins(settings) if found is None else found
     if not allow_low_margin:
         refuse_chatter(config, settings)
     refuse_diverging_learning(learning_of(config, settings))

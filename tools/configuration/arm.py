@@ -32,7 +32,7 @@ from jointctl.tools.configuration.urdf import Body, LARGEST_LENGTH_m, Urdf, bodi
 
 LARGEST_ARM = 16  # joints
 PER_JOINT_TEXT = "a list of numbers, one a joint"
-SHORTEST_MOVE_s = 0.1
+SHORTEST_MOVE_s, LONGEST_MOVE_s = 0.1, 1e5
 SPEED_SHARE = 0.9  # of limits.velocity_max_radps that an automatic move may use
 TORQUE_SHARE = 0.5  # of limits.torque_max_Nm that it may give the joint's inertia
 
@@ -48,7 +48,7 @@ PerJoint = Annotated[tuple[float, ...], BeforeValidator(Rule(PER_JOINT_TEXT, _pe
 
 
 def _auto_or_time(value: object) -> Any:
-    if value == "auto" or (is_number(value) and 1e-3 <= value <= 1e5):
+    if value == "auto" or (is_number(value) and 1e-3 <= value <= LONGEST_MOVE_s):
         return value
     raise PydanticCustomError("range", 'must be "auto" or in [0.001..1e5]')
 
@@ -100,7 +100,7 @@ def shortest_move_s(configs: tuple[Config, ...], way_rad: tuple[float, ...]) -> 
             longest, QUINTIC_PEAK_SPEED * abs(way) / speed,
             math.sqrt(QUINTIC_PEAK_ACCELERATION * abs(way) / acceleration),
         )  # fmt: skip
-    return math.ceil(longest * 1e3) * 1e-3
+    return math.ceil(min(longest, LONGEST_MOVE_s) * 1e3) * 1e-3
 
 
 def trajectories(motion: ArmTrajectory, configs: tuple[Config, ...], names: tuple[str, ...]) -> Iterator[Trajectory]:
@@ -299,6 +299,8 @@ def _names(path: Path, arm: ArmSection, urdf: Urdf) -> tuple[tuple[str, ...], li
     ]
     if len(set(names)) < len(names):
         wrong.append(f"arm.joint_names (={', '.join(names)}) must not name a joint twice")
+    if len(set(arm.joints)) < len(arm.joints):
+        wrong.append(f"arm.joints (={', '.join(arm.joints)}) must not name a file twice: each joint has its own")
     if not wrong and len(names) != len(arm.joints):
         key = "arm.joint_names" if arm.joint_names is not None else f"{urdf.path.name}: joints that move"
         wrong.append(f"{key} (={len(names)}: {', '.join(names)}) must be as many as arm.joints (={len(arm.joints)})")
@@ -332,6 +334,13 @@ def _bodies(
         inertias = tuple(0.0 if c.reducer is None else c.reducer.motor_inertia_kgm2 for c in joints)
     elif len(inertias) != len(joints) or min(inertias) < 0.0:
         wrong.append(f"arm.motor_inertia_kgm2 (={list(inertias)}) must be {len(joints)} inertias, one a joint")
+    else:
+        wrong += [
+            f"arm.motor_inertia_kgm2 (={inertia:g}) of {config.path.name} must be its reducer.motor_inertia_kgm2 "
+            f"(={config.reducer.motor_inertia_kgm2:g})"
+            for inertia, config in zip(inertias, joints, strict=True)
+            if config.reducer is not None and not math.isclose(inertia, config.reducer.motor_inertia_kgm2)
+        ]
     raise_if([f"{path}: {line}" for line in wrong])
     last = bodies[-1]
     if arm.payload_kg > 0.0:

@@ -133,6 +133,8 @@ def read_urdf(path: Path) -> Urdf:
     except ElementTree.ParseError as error:
         words = "; it seems to be xacro, which must be expanded first" if b"<xacro:" in content else ""
         raise ConfigurationError(f"{path}: not valid XML: {error}{words}") from None
+    except (LookupError, ValueError) as error:  # of the encoding that the file says it has
+        raise ConfigurationError(f"{path}: not valid XML: {error}; save it as UTF-8") from None
     if robot.tag != "robot":
         raise ConfigurationError(f"{path}: the outermost element (={robot.tag}) must be robot; is it a URDF?")
     return _Reader(path).read(robot)

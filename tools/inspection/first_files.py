@@ -319,6 +319,7 @@ _TURN_rad = 3.1  # to each side, of a joint that may turn on for ever
 # natural frequency of the loop [rad/s] and disturbance observer [rad/s], the stiffest first
 _GAINS = ((60.0, 60.0), (45.0, 40.0), (30.0, 20.0), (20.0, 15.0), (12.0, 8.0), (8.0, 5.0))
 _MARGIN_TO_SPARE_deg = 2.0  # a run measures the loop delay, which check takes as configured
+_JUMP_SHARE = 1.5  # of the way in a period at the greatest speed that is a jump
 _SPEED_SHARE, _LARGEST_SWING_rad, _FIRST_Hz = 0.2, 0.3, 0.1  # of the motion to begin with
 
 
@@ -434,6 +435,7 @@ class _Draft:
             ("limits", "position_max_rad"): high,
             ("limits", "velocity_max_radps"): joint.velocity_max_radps,
             ("limits", "torque_max_Nm"): joint.effort_max_Nm,
+            ("limits", "position_jump_max_rad"): self.jump_rad(joint),
             ("joint", "inertia_kgm2"): self.inertias_kgm2[i] if self.inertias_kgm2 else 1.0,
             ("loop", "rate_Hz"): self.rate_Hz,
             **{("control", key): value for key, value in gains.items()},
@@ -441,6 +443,7 @@ class _Draft:
             ("control", "velocity_cutoff_Hz"): 0.2 * self.rate_Hz,
             ("trajectory", "amplitude_rad"): swing_rad,
             ("trajectory", "frequency_Hz"): frequency_Hz,
+            ("trajectory", "offset_rad"): middle_rad,
             ("virtual", "initial_position_rad"): middle_rad,
             **self.answers[i].values,
         }
@@ -456,6 +459,12 @@ class _Draft:
         amplitude = min(_LARGEST_SWING_rad, 0.2 * (high - low), fastest)
         middle = min(max(0.0, low + 1.5 * amplitude), high - 1.5 * amplitude)
         return float(f"{amplitude:.3g}"), frequency_Hz, round(middle, 4)
+
+    def jump_rad(self, joint: UrdfJoint) -> float:
+        """Between two samples at this rate: the template's, or more where the joint moves on by more."""
+        assert joint.velocity_max_radps is not None
+        way_rad = _JUMP_SHARE * joint.velocity_max_radps / self.rate_Hz
+        return max(_template_value("position_jump_max_rad"), float(f"{way_rad:.3g}"))
 
     def arm_text(self) -> str:
         files = file_names(self.joints)

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
-from jointctl.drivers.errors import BusError, JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.firmware_py.trajectory import approach_start, peak_of
+from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
+from jointctl.tools.analysis.margin_gate import require_loop, require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import (
     axis_constants,
@@ -39,8 +40,11 @@ from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.written_file import file_stems
 
 if TYPE_CHECKING:
+    from jointctl.tools.analysis.arm_check import PoseRange
+    from jointctl.tools.analysis.margins import Margins
     from jointctl.tools.configuration.arm import ArmConfig
 
+UNTIL_STOPPED_s = 60.0  # of a motion without an end that are looked at
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 
 
@@ -75,6 +79,16 @@ class JointPlan:
     motion: Motion
     log_path: Path
     name: str = ""
+    poses: PoseRange | None = None  # of a joint of an arm: what its loop must bear
+
+    def require_margin(self, delay_s: float, *, allow_low_margin: bool) -> Margins:
+        """See `margin_gate.require_margin`; of a joint of an arm over its poses."""
+        if self.poses is None:
+            return require_margin(self.config, delay_s, allow_low_margin=allow_low_margin)
+        from jointctl.tools.analysis.arm_check import joint_loop
+
+        loop = joint_loop(self.name, self.config, self.poses, delay_s)
+        return require_loop(loop.config, loop.settings, loop.margins, allow_low_margin=allow_low_margin)
 
     def lines(self, lines: Iterable[str]) -> list[str]:
         """Of its envelope, below its name where it is one of several."""
@@ -126,7 +140,8 @@ class RunPlan:
         constants = self.arm.config.connected([each.constants for each in placed])
         lines: list[str] = []
         for axis, joint, report in zip(constants, joints, reports, strict=True):
-            lines += joint.lines(joint.motion.envelope(axis, report))
+            with blamed(joint.name):
+                lines += joint.lines(joint.motion.envelope(axis, report))
         return Placed(constants, placed[0].table, tuple(lines))
 
 
@@ -217,20 +232,40 @@ def resolve_arm(
 ) -> RunPlan:
     """The plan of a run of an arm: each joint has its part of the motion, and a log of its own.
 
-    `ConfigurationError` also where a bus cannot carry the joints on it.
+    `ConfigurationError` also where a bus cannot carry the joints on it, or a joint not the arm in its poses and motion.
     """
-    from jointctl.tools.analysis.arm_check import require_budgets  # a single joint does not wait for it
+    from jointctl.tools.analysis.arm_check import require_budgets, require_held  # a single joint does not wait for it
 
     require_budgets(arm)
+    ranges = require_held(arm)
     named = arm.joints[0].model_copy()
     named._path = arm.path
     path = log_path(named)
     joints = []
-    for config, name, stem in zip(arm.joints, arm.names, file_stems(arm.names), strict=True):
-        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{stem}.mcap"), name))
+    for config, name, stem, poses in zip(arm.joints, arm.names, file_stems(arm.names), ranges, strict=True):
+        try:
+            own = motion(config)
+        except ConfigurationError as error:  # its [trajectory] is not that of its file
+            error.message = "\n".join(f"{arm.path}: with [motion], {line}" for line in error.message.splitlines())
+            raise
+        joints.append(JointOfArmPlan(config, own, path.with_name(f"{path.stem}.{stem}.mcap"), name, poses))
+    if motion is configured:
+        _require_torques(arm, joints)
     first = joints[0]
     plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)
+
+
+def _require_torques(arm: ArmConfig, joints: Sequence[JointPlan]) -> None:
+    """`ConfigurationError` where the arm's model asks more of a joint than its limit in the configured motion."""
+    from jointctl.tools.analysis.arm_check import require_torques
+
+    trajectories = new(TrajectoryConstants, len(joints))
+    for trajectory, joint in zip(trajectories, joints, strict=True):
+        fill_trajectory(trajectory, joint.config, joint.motion.table)
+    duration_s = joints[0].config.trajectory.duration_s or UNTIL_STOPPED_s
+    tables = stacked_tables([joint.motion.table for joint in joints])
+    require_torques(arm, trajectories, tables, duration_s, lambda: None)
 
 
 class FreeMotion:
@@ -294,11 +329,27 @@ class ConfiguredMotion:
             )
 
     def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
-        """Lines that say where the joint will go, how fast, with how much torque, for how long."""
-        config = self.config
+        """Lines that say where the joint will go, how fast, with how much torque, for how long.
+
+        `MotionFault` where the approach, which may swing back for the speed that the trajectory begins with, would
+        leave the limits.  The longer the farther: in an arm it takes as long as that of the slowest joint.
+        """
+        config, limits = self.config, self.config.limits
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
         first = approach_start(axis.trajectory, self.table)
         approach = float(axis.sequence.approach_s)
+        if approach:
+            way = approach_peak(report.start_position_rad, first, approach)
+            for far_rad in (way.position_min_rad, way.position_max_rad):
+                inside = limits.position_min_rad <= far_rad <= limits.position_max_rad
+                if not inside and far_rad != report.start_position_rad:  # where it stands is the loop's to judge
+                    raise MotionFault(
+                        f"the approach from {report.start_position_rad:+.4f} rad in {approach:.1f} s swings to "
+                        f"{far_rad:+.4f} rad, must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], "
+                        "the limits.position_*_rad",
+                        "begin nearer to the beginning of the motion, of an arm with all joints, or with a motion "
+                        "that begins at rest",
+                    )
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
         return [

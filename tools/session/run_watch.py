@@ -30,7 +30,7 @@ from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.records import AxisConstants, LawConstants
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
-from jointctl.tools.analysis.margin_gate import cascade_text, require_margin
+from jointctl.tools.analysis.margin_gate import cascade_text
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.recording.ros_messages import frame_array
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, ThinnedRecords
@@ -486,7 +486,7 @@ class RunWatch:
         if self._drives_loop_ps is not None:
             margin_deg = math.degrees(0.5 * math.pi - self._drives_loop_ps * delay_s)
             return f"position correction with {margin_deg:.0f} deg phase margin"
-        found = require_margin(self.config, delay_s, allow_low_margin=self._allow_low_margin)
+        found = self.joint.require_margin(delay_s, allow_low_margin=self._allow_low_margin)
         return f"phase margin {found.phase_margin_deg:.0f} deg"
 
     def _tell(self, event: Event, *, shown: bool = True) -> None:

@@ -58,10 +58,20 @@ class StreamedLoop(Protocol):
         """`JointctlError` if the joint follows nothing, with the cause."""
 
 
+def _number(value: Any) -> float:
+    """As `float`, but no text, and no answer to a question."""
+    if isinstance(value, (str, bytes, bool, np.bool_)):
+        raise TypeError
+    try:
+        return float(value)
+    except OverflowError:  # a whole number beyond all others
+        return math.inf
+
+
 def finite(name: str, value: float) -> float:
     """`ConfigurationError` for what is no finite number."""
     try:
-        number = float(value)
+        number = _number(value)
     except (TypeError, ValueError):
         raise ConfigurationError(f"{name} (={str(value)[:40]}) must be a number") from None
     if not math.isfinite(number):
@@ -73,8 +83,8 @@ def vector(name: str, given: object, names: Sequence[str]) -> tuple[float, ...]:
     """One number for each joint, finite or not; `SetPointError` for what is none."""
     try:
         values: Any = given if isinstance(given, (Sequence, np.ndarray)) and np.ndim(given) else (given,)
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError, OverflowError):
+        numbers = tuple(map(_number, values))
+    except (TypeError, ValueError):
         raise SetPointError("a set-point must be made of numbers") from None
     if len(numbers) != len(names):
         raise SetPointError(f"{name} (={len(numbers)} numbers) must have {len(names)}, one a joint")

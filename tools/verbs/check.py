@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -145,7 +145,8 @@ def check_cascade(
 def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False) -> int:
     """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
     from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
-    from jointctl.tools.analysis.margin_gate import meets
+    from jointctl.tools.analysis.margin_gate import require_loop
+    from jointctl.tools.session.plan import blamed
 
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
     table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
@@ -154,7 +155,6 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
             f"{', '.join(budget.joints)}: {budget.bits} bits a cycle at {arm.rate_Hz:g} Hz, {HIGHEST_LOAD:.0%} allowed"
         )
         table.add_row(budget.channel, f"{budget.load:.1%} of the bus", note)
-    refused = []
     for loop in loops:
         table.add_section()
         found, minimum_deg, own = loop.margins, loop.config.margin.min_phase_margin_deg, loop.config.joint.inertia_kgm2
@@ -170,8 +170,6 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
                 f"{loop.config.path}: joint.inertia_kgm2 (={own:g}) should be in "
                 f"[{poses.least_kgm2:.3g}..{poses.greatest_kgm2:.3g}], what the arm's poses give"
             )
-        if not meets(found, minimum_deg) and not (found.stable and allow_low_margin):
-            refused.append(loop)
     data = {
         "buses": [asdict(budget) for budget in budgets],
         "joints": [
@@ -181,14 +179,9 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
         ],
     }  # fmt: skip
     output.result(table, data)
-    if refused:
-        from jointctl.tools.analysis.margin_gate import refusal, remedies
-
-        first = refused[0]
-        minimum_deg = first.config.margin.min_phase_margin_deg
-        changes = remedies(first.settings, minimum_deg)
-        error = refusal(first.settings, first.margins, minimum_deg, changes)
-        raise MarginError(f"joint {first.name}: {error.message}", error.hint)
+    for loop in loops:
+        with blamed(f"joint {loop.name}"):
+            require_loop(loop.config, loop.settings, loop.margins, allow_low_margin=allow_low_margin)
     return 0
 
 

@@ -24,7 +24,7 @@ from jointctl.tools.analysis.arm_check import (
 from jointctl.tools.analysis.linear_loop import RigidJoint, loop_settings
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import JointEncoder, Reducer
 from jointctl.tools.verbs.check import check
@@ -154,6 +154,13 @@ def test_gravity_beyond_the_torque_is_refused(arm: ArmConfig) -> None:
     joints = (arm.joints[0].model_copy(update={"limits": weak}), *arm.joints[1:])
     with pytest.raises(ConfigurationError, match=r"joint shoulder: gravity reaches 32\.7 Nm"):
         joint_loops(replace(arm, joints=joints))
+
+
+def test_check_refuses_what_the_gate_of_a_run_refuses(arm: ArmConfig) -> None:
+    learning = Learning(gain=1.0, error_gain_ps2=1e5, lead_cycles=0, half_width_cycles=0)
+    joints = (*arm.joints[:2], changed(arm.joints[2], control__adaptation=None, control__learning=learning))
+    with pytest.raises(MarginError, match="wrist: iterative learning would diverge"):
+        check(replace(arm, joints=joints), output()[0])
 
 
 def test_the_files_of_an_arm_of_ones_own(tmp_path: Path) -> None:

@@ -274,6 +274,12 @@ def test_entities_are_refused_in_whatever_encoding_the_file_is(folder: Path) -> 
         assert "must have no DOCTYPE and no entities" in problem(folder)
 
 
+@pytest.mark.parametrize("encoding", ["no-such", "shift_jis", "rot13"])
+def test_an_encoding_that_the_parser_does_not_know(folder: Path, encoding: str) -> None:
+    change(folder / "arm.urdf", r"^<\?xml.*?\?>", f'<?xml version="1.0" encoding="{encoding}"?>')
+    assert "arm.urdf: not valid XML: " in problem(folder)
+
+
 IN_FILES: list[tuple[str, str, str, str]] = [
     ("elbow.toml", r"node = 2", "node = 1", "elbow.toml: drive.node (=1) must differ from drive.node of shoulder.toml"),
     ("wrist.toml", r"rate_Hz = 1000.0", "rate_Hz = 500.0", "wrist.toml: loop.rate_Hz (=500) must be that of shoulder"),
@@ -291,6 +297,19 @@ IN_FILES: list[tuple[str, str, str, str]] = [
     ("arm.toml", r'feed_forward = "whole"', 'feed_forward = "all"', "arm.feed_forward (=all) must be"),
     ("arm.toml", r"motor_inertia_kgm2 = \[.*?\]", "", "arm.motor_inertia_kgm2 must be given"),
     ("arm.toml", r'urdf = "arm.urdf"', 'urdf = "no.urdf"', "cannot be read"),
+    ("arm.toml", r'"elbow.toml"', '"shoulder.toml"', "arm.joints (=shoulder.toml, shoulder.toml, wrist.toml) must not"),
+    (
+        "arm.toml",
+        r"\[motion\].*",
+        "[motion]\nkind = 'min_jerk'\nduration_s = 1\nstart_rad = [0, 0, 0]\ntarget_rad = [1e308, 0, 0]\n",
+        "motion.target_rad (=1e+308) must be in [-1000..1000] (joint shoulder)",
+    ),
+    (
+        "wrist.toml",
+        r"\[limits\]",
+        "[reducer]\nmotor_inertia_kgm2 = 0.05\nstiffness_Nmprad = 5e4\n[limits]",
+        "arm.motor_inertia_kgm2 (=0.12) of wrist.toml must be its reducer.motor_inertia_kgm2 (=0.05)",
+    ),
 ]  # fmt: skip
 
 
@@ -298,6 +317,12 @@ IN_FILES: list[tuple[str, str, str, str]] = [
 def test_files_that_do_not_fit_together(folder: Path, name: str, pattern: str, text: str, words: str) -> None:
     change(folder / name, pattern, text)
     assert words in problem(folder)
+
+
+def test_the_motors_inertias_may_be_in_both_places(folder: Path) -> None:
+    reducer = "[reducer]\nmotor_inertia_kgm2 = 0.12\nstiffness_Nmprad = 5e4\n[limits]"
+    change(folder / "wrist.toml", r"\[limits\]", reducer)
+    load_arm(folder / "arm.toml")
 
 
 def test_two_buses_may_have_the_same_node(folder: Path) -> None:

@@ -103,6 +103,20 @@ def test_seven_joints_get_the_rate_that_one_bus_carries(tmp_path: Path) -> None:
     assert len({canopen_section(config).node for config in arm.joints}) == 7
 
 
+@pytest.mark.parametrize("limit", [
+    '<limit lower="-3.0718" upper="-0.0698" velocity="2.175" effort="87"/>',  # its range is beside 0
+    '<limit lower="-0.0175" upper="3.7525" velocity="2.61" effort="12"/>',
+    '<limit lower="-1.5" upper="1.5" velocity="30" effort="60"/>',  # on by more than the template's jump in a period
+])  # fmt: skip
+def test_limits_that_are_not_like_the_templates(tmp_path: Path, limit: str) -> None:
+    arm = load_arm(made(tmp_path, robot(joint(1, limit), (1.0,))))
+    (config,) = arm.joints
+    assert config.limits.position_jump_max_rad >= max(0.02, config.limits.velocity_max_radps / arm.rate_Hz)
+    load_config(config.path)  # alone as well
+    require_budgets(arm)
+    joint_loops(arm)
+
+
 def test_joints_that_are_not_named_stand_at_0(tmp_path: Path) -> None:
     arm = load_arm(made(tmp_path, GOOD, joints="j1"))
     assert arm.names == ("j1",)

@@ -290,3 +290,27 @@ def shipped_joint() -> Path:
 def test_a_joint_is_no_arm(make: Callable[[], object], words: str) -> None:
     with pytest.raises(jointctl.ConfigurationError, match=words):
         make()
+
+
+@pytest.mark.parametrize("value", ["0.1", b"1", True, np.True_, 10**400], ids=str)
+def test_what_python_takes_for_a_number_and_is_none_moves_nothing(arm: jointctl.Arm, value: Any) -> None:
+    rest = arm.state.desired_position_rad
+    given: Any = [*rest[:2], value]
+    with pytest.raises(jointctl.ConfigurationError, match="position_rad of wrist "):
+        arm.move_to(given)
+    with pytest.raises(jointctl.SetPointError):
+        arm.command(given, time_s=0.01)
+    arm.step(0.1)
+    assert np.array_equal(arm.state.desired_position_rad, rest)
+
+
+@pytest.mark.parametrize("given", [3, None, b"virtual"])
+def test_what_names_no_configuration_is_refused_in_words(given: Any) -> None:
+    for made in (jointctl.Arm, jointctl.Joint):
+        with pytest.raises(jointctl.ConfigurationError, match="must be a file, a name, or"):
+            made(given)
+
+
+def test_outside_of_its_block_there_is_no_state() -> None:
+    with pytest.raises(jointctl.MotionFault, match="not commissioned"):
+        print(jointctl.Arm("virtual").state)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,15 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, UsageError
+from jointctl.drivers.errors import (
+    BusError,
+    ConfigurationError,
+    DeviceError,
+    JointctlError,
+    MarginError,
+    MotionFault,
+    UsageError,
+)
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.drive_section import GivenPlace
@@ -20,7 +29,7 @@ from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_buses
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
-from jointctl.tools.session.plan import blamed, resolve_arm
+from jointctl.tools.session.plan import blamed, free, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from tests.configurations import changed
@@ -49,6 +58,70 @@ def test_the_envelope_names_every_joint_and_their_common_approach(arm: ArmConfig
     assert np.all(approaches == approaches[0])  # what is shown is what the loop gets
     assert round(float(approaches[0]), 1) in shown
     assert [float(start) for start in placed.constants.sequence.start_rad] == [0.1, 0.2, -0.3]
+
+
+def test_the_gate_before_enabling_is_that_of_the_poses(arm: ArmConfig) -> None:
+    """An inertia that no pose has: alone the joint would have its margin."""
+    wrong = replace(arm, joints=(*arm.joints[:2], changed(arm.joints[2], joint__inertia_kgm2=0.4)))
+    joints = resolve_arm(wrong).joints
+    for joint in (*joints[:2], replace(joints[2], poses=None)):
+        assert joint.require_margin(0.001, allow_low_margin=False).phase_margin_deg > 35.0
+    with pytest.raises(MarginError, match=r"must be at least 30 deg: .*worst case: inertia 0\.133 kg m2"):
+        joints[2].require_margin(0.001, allow_low_margin=False)
+    assert joints[2].require_margin(0.001, allow_low_margin=True).stable
+
+
+def test_an_arm_that_a_joint_cannot_hold_is_refused_before_anything_is_sent(arm: ArmConfig) -> None:
+    weak = changed(arm.joints[0], limits__torque_max_Nm=30.0)
+    with pytest.raises(ConfigurationError, match="joint shoulder: gravity reaches 32"):
+        resolve_arm(replace(arm, joints=(weak, *arm.joints[1:])))
+
+
+def moving(tmp_path: Path, motion: str, table: str = "") -> ArmConfig:
+    """The shipped arm with this [motion], and a table in way.csv."""
+    folder = Path(shutil.copytree(SHIPPED_ARM.parent, tmp_path / "arm"))
+    (folder / "way.csv").write_text(table)
+    text = (folder / "arm.toml").read_text()
+    (folder / "arm.toml").write_text(text[: text.index("[motion]")] + motion)
+    return load_arm(folder / "arm.toml")
+
+
+@pytest.mark.parametrize(("frequency_Hz", "duration_s", "allowed"), [
+    (11.0, 5.0, False), (11.0, 0.0, False), (4.0, 5.0, True),
+])  # fmt: skip
+def test_a_motion_that_takes_more_than_a_joints_torque_is_refused_before_anything_is_sent(
+    tmp_path: Path, frequency_Hz: float, duration_s: float, allowed: bool
+) -> None:
+    """Within all limits of position and speed."""
+    motion = f"duration_s = {duration_s}\namplitude_rad = [0.04, 0.04, 0.04]\nfrequency_Hz = [{frequency_Hz}, 0.1, 0.1]"
+    arm = moving(tmp_path, f'[motion]\nkind = "sine"\n{motion}\n')
+    resolve_arm(arm, free)  # that is not what it does there
+    if allowed:
+        resolve_arm(arm)
+    else:
+        with pytest.raises(ConfigurationError, match=r"^shoulder: the motion takes .* must be in \[-145\.\.145\]"):
+            resolve_arm(arm)
+
+
+def test_what_is_wrong_with_a_table_is_the_arms_motion_and_not_the_joints(tmp_path: Path) -> None:
+    table = "time_s,shoulder_rad,elbow_rad,wrist_rad\n0,0,0,0\n0.1,0,1,0\n2,0,0,0\n"
+    arm = moving(tmp_path, '[motion]\nkind = "table"\nduration_s = 1.0\nfile = "way.csv"\n', table)
+    with pytest.raises(ConfigurationError) as caught:
+        resolve_arm(arm)
+    lines = caught.value.message.splitlines()
+    assert len(lines) == 2
+    assert all(re.match(r".*arm\.toml: with \[motion\], .*elbow\.toml: trajectory: ", line) for line in lines)
+
+
+def test_an_approach_that_swings_beyond_a_limit_is_refused_before_anything_moves(arm: ArmConfig) -> None:
+    """The wrist begins with speed, and has as long for its approach as the shoulder needs from its limit."""
+    plan = resolve_arm(arm)
+    plan.placed([report(start) for start in (1.0, 0.1, 0.1)])
+    with pytest.raises(
+        MotionFault, match=r"^wrist: the approach from \+0\.1000 rad in 5.* must be in \[-1\.9\.\.1\.9\]"
+    ):
+        plan.placed([report(start) for start in (1.39, 0.1, 0.1)])
+    plan.placed([report(start) for start in (0.1, 2.1, 0.1)])  # stands beyond its limit: that is the loop's fault
 
 
 def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:

@@ -13,7 +13,7 @@ import pytest
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.tools.output import Output
-from jointctl.tools.session import run_watch
+from jointctl.tools.session import plan as run_plan
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
@@ -55,7 +55,7 @@ class Slow:
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
     margins = Slow()
-    monkeypatch.setattr(run_watch, "require_margin", margins)
+    monkeypatch.setattr(run_plan, "require_margin", margins)
     return margins
 
 
