@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 
 from jointctl.drivers.canopen.eds import EdsFile, read_eds
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import parse_toml
 from jointctl.tools.configuration.checks import range_problems
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import section_class
@@ -121,7 +122,7 @@ def default_of(place: Place) -> object:
 def answer_value(text: str) -> Any:
     """What somebody typed: a TOML value, else the text as it is."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
 

@@ -190,7 +190,8 @@ def test_every_marked_line_can_be_filled_and_checked() -> None:
 @pytest.mark.parametrize(
     ("place", "text"),
     [(("encoder", "direction"), "2"), (("encoder", "side"), "shaft"), (("limits", "torque_max_Nm"), "-1"),
-     (("encoder", "counts_per_turn"), "4096.5"), (("drive", "node"), "128"), (("joint", "inertia_kgm2"), "nan")],
+     (("encoder", "counts_per_turn"), "4096.5"), (("drive", "node"), "128"), (("joint", "inertia_kgm2"), "nan"),
+     *((("limits", "torque_max_Nm"), digits * "9") for digits in (400, 5000))],
 )  # fmt: skip
 def test_an_answer_that_may_not_be_is_refused_by_name(place: tuple[str, str], text: str) -> None:
     with pytest.raises(ValueError, match=rf"{place[0]}\.{place[1]} \(={re.escape(text)}\) "):
