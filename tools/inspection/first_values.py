@@ -248,7 +248,15 @@ def _encoder(reader: SdoReader, found: FirstValues) -> None:
     counts, turns = reader.value(0x608F, 1), reader.value(0x608F, 2)
     motor, shaft = reader.value(0x6091, 1), reader.value(0x6091, 2)
     ratio, origin = (motor / shaft, "6091") if motor and shaft and motor != shaft else (None, "")
-    if counts and counts > 3 and turns:
+    feed, shaft_turns = reader.value(0x6092, 1), reader.value(0x6092, 2)
+    if feed and shaft_turns and counts and turns and feed * turns != counts * shaft_turns:
+        found.remarks.append(
+            f"6092 is {feed}:{shaft_turns}: by it 6064 is not in counts of the encoder (608F) but in units of that "
+            "feed, and encoder.counts_per_turn must be in them"
+        )
+        if feed % shaft_turns == 0 and feed > 3 * shaft_turns:
+            found.suggested["encoder", "counts_per_turn"] = feed // shaft_turns, "6092; compare it with a turn by hand"
+    elif counts and counts > 3 and turns:
         if counts % turns == 0:
             found.known["encoder", "counts_per_turn"] = counts // turns, "608F"
             found.suggested["encoder", "side"] = "motor", "608F counts turns of the motor"

@@ -124,6 +124,15 @@ class Inverting(SdoReader):
         return 0xC0 if index == 0x607E else super().value(index, sub)
 
 
+class Scaling(SdoReader):
+    """With an object 6092, which the virtual drive lacks."""
+
+    feed = (0, 0)
+
+    def value(self, index: int, sub: int = 0) -> Any:
+        return self.feed[sub - 1] if index == 0x6092 else super().value(index, sub)
+
+
 def reader_of(joint: DeviceOnBus) -> Any:
     return canopen_network(Subject("virtual", joint.channel, None, 1))
 
@@ -163,6 +172,24 @@ def test_whose_turns_608f_counts(
     assert found.known["encoder", "counts_per_turn"][0] == per_turn
     assert found.suggested["encoder", "side"][0] == side
     assert found.suggested.get(("joint", "reduction_ratio"), (None,))[0] == ratio
+
+
+@pytest.mark.parametrize(
+    ("feed", "shaft_turns", "taken", "suggested"),
+    [(360_000, 1, None, 360_000), (720_000, 2, None, 360_000), (1, 1, None, None), (8192, 2, 4096, None),
+     (0, 0, 4096, None)],
+)  # fmt: skip
+def test_counts_of_the_encoder_are_not_taken_where_the_drive_scales_its_position(
+    tmp_path: Path, joint: DeviceOnBus, feed: int, shaft_turns: int, taken: int | None, suggested: int | None
+) -> None:
+    joint.answers |= {(0x608F, 1): 4096, (0x608F, 2): 1}
+    with reader_of(joint) as network:
+        reader = Scaling(network, 1)
+        reader.feed = (feed, shaft_turns)
+        found = first_values(reader, tmp_path)
+    place = "encoder", "counts_per_turn"
+    assert (found.known.get(place, (None,))[0], found.suggested.get(place, (None,))[0]) == (taken, suggested)
+    assert any("6092 is" in remark for remark in found.remarks) is (taken is None)
 
 
 def test_the_eds_by_identity(tmp_path: Path) -> None:
