@@ -9,11 +9,11 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError, NoDeviceError, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, NoDeviceError, UsageError
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, read_text, shipped_config
 from jointctl.tools.inspection.first_values import checked, eds_of_identity, filled, first_values, marks
@@ -115,6 +115,24 @@ def test_the_file_is_not_asked_for_if_it_exists(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text("mine")
     with pytest.raises(Exception, match="exists already"):
         new(tmp_path / "mine.toml", output()[0], drive=DriveOptions("none", "none", None, 1))
+
+
+def test_a_folder_that_is_not_there_is_refused_before_the_drive_is_asked(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be written: No such file"):
+        new(tmp_path / "none" / "mine.toml", output()[0], drive=DriveOptions("none", "none", None, 1))
+
+
+def test_nothing_is_left_of_a_file_for_which_the_disk_has_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(path: Path, *_: str, **__: str) -> IO[str]:
+        path.touch()
+        return open("/dev/full", "w")
+
+    monkeypatch.setattr(Path, "open", opened)
+    with pytest.raises(DataError, match="cannot be written: No space left"):
+        new(tmp_path / "mine.toml", output()[0])
+    assert list(tmp_path.iterdir()) == []
 
 
 class Inverting(SdoReader):
