@@ -231,7 +231,7 @@ def _scaled_units(objects: ObjectAccess) -> list[str]:
                 f"6091 is {above}:{below}: the drive scales 6064 and 607A by it; encoder.counts_per_turn and "
                 "joint.reduction_ratio must be those of the scaled position"
             )
-        elif index == 0x6092 and objects.has(0x608F, 1) and above != objects.read(0x608F, 1, what="resolution"):
+        elif index == 0x6092 and above and below and counts_per_motor_turn(objects) not in (0.0, above / below):
             found.append(
                 f"6092 is {above}:{below}: 6064 and 607A are not counts of the encoder (608F) but units of that feed, "
                 "and encoder.counts_per_turn must be in them"
@@ -254,7 +254,6 @@ def require_own_loop(objects: ObjectAccess, settings: CanopenSettings, findings:
         )
     if not objects.has(0x6077):
         findings.remarks.append("no object 6077: a torque at its limit, or one that swings, is not noticed")
-    findings.remarks += _scaled_units(objects)
 
 
 def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
@@ -506,5 +505,5 @@ def commission(
         findings.settings["joint encoder"] = findings.second.words
     findings.start_counts = objects.read(0x6064, what="position actual value")
     findings.counts_per_motor_turn = counts_per_motor_turn(objects)
-    findings.remarks += objects.remarks
+    findings.remarks += [*_scaled_units(objects), *objects.remarks]
     return findings

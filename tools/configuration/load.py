@@ -185,7 +185,7 @@ def understood(key: str, text: str) -> float | int | None:
     value = float(match[1].replace("_", "")) * _FACTORS[unit][match[2]]
     if unit not in WHOLE:
         return value
-    return round(value) if abs(value - round(value)) < 1e-6 else None
+    return round(value) if math.isfinite(value) and abs(value - round(value)) < 1e-6 else None
 
 
 def echo(key: str, text: str, value: float) -> str:

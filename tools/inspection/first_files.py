@@ -22,6 +22,7 @@ from pydantic.fields import FieldInfo
 
 from jointctl.drivers.canopen.eds import EdsFile, read_eds
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import parse_toml
 from jointctl.tools.analysis.arm_check import BusBudget, JointOfArm, RATES_Hz, bus_budgets, joint_loop, pose_ranges
 from jointctl.tools.configuration.arm import LARGEST_ARM, SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.checks import range_problems
@@ -128,7 +129,7 @@ def default_of(place: Place) -> object:
 def answer_value(text: str) -> Any:
     """What somebody typed: a TOML value, else the text as it is."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
 
@@ -254,7 +255,15 @@ def _encoder(reader: SdoReader, found: FirstValues) -> None:
     counts, turns = reader.value(0x608F, 1), reader.value(0x608F, 2)
     motor, shaft = reader.value(0x6091, 1), reader.value(0x6091, 2)
     ratio, origin = (motor / shaft, "6091") if motor and shaft and motor != shaft else (None, "")
-    if counts and counts > 3 and turns:
+    feed, shaft_turns = reader.value(0x6092, 1), reader.value(0x6092, 2)
+    if feed and shaft_turns and counts and turns and feed * turns != counts * shaft_turns:
+        found.remarks.append(
+            f"6092 is {feed}:{shaft_turns}: by it 6064 is not in counts of the encoder (608F) but in units of that "
+            "feed, and encoder.counts_per_turn must be in them"
+        )
+        if feed % shaft_turns == 0 and feed > 3 * shaft_turns:
+            found.suggested["encoder", "counts_per_turn"] = feed // shaft_turns, "6092; compare it with a turn by hand"
+    elif counts and counts > 3 and turns:
         if counts % turns == 0:
             found.known["encoder", "counts_per_turn"] = counts // turns, "608F"
             found.suggested["encoder", "side"] = "motor", "608F counts turns of the motor"

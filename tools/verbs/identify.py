@@ -360,6 +360,8 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
     def one(path: Path) -> Motion:
         if path.suffix.lower() == ".mcap":
             return motion_of_log(path, read_run_log(path), given, settings)
+        if not path.exists():
+            raise DataError(f"{path}: no such file")
         if not is_series(path, given):
             raise DataError(
                 f"{path}: is no motion in time",

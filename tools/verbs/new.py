@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,6 +15,7 @@ import typer
 from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput, shipped_configurations
+from jointctl.tools.written_file import writing
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.urdf import UrdfJoint
@@ -73,6 +76,8 @@ def new(
         raise DataError(f"{path}: the name of a configuration must end in .toml")
     if path.exists():
         raise DataError(f"{path}: exists already, a configuration is never overwritten")
+    with writing(path), TemporaryFile(dir=path.parent):  # before anything is asked
+        pass
     if drive != NOBODY:
         text = filled(text, _from_drive(drive, text, path.parent, output, ask=not no_input))
     try:
@@ -81,6 +86,8 @@ def new(
     except FileExistsError:
         raise DataError(f"{path}: exists already, a configuration is never overwritten") from None
     except OSError as error:
+        with suppress(OSError):
+            path.unlink()  # half of it would count as a configuration of the user
         raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
     output.note(f"written: {path}, a copy of {source.name}")
     marked = text.count("FILL IN: ")

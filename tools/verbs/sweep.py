@@ -156,6 +156,7 @@ class Sweep:
         from jointctl.tools.configuration.conversions import torque_constant_NmpA
         from jointctl.tools.session.display import Displays, PhaseLines
         from jointctl.tools.session.fault_words import fault_text
+        from jointctl.tools.session.loop_process import slow_start
         from jointctl.tools.session.session import Session
         from jointctl.tools.sweeping.carry_out import (
             MeterDisplay,
@@ -185,7 +186,8 @@ class Sweep:
                 self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
 
         if options.lockstep:
-            ended = sweep_in_lockstep(swept, meter, self._consent, begin)
+            with slow_start(self.output.note, "simulation"):
+                ended = sweep_in_lockstep(swept, meter, self._consent, begin)
             if ended is None:
                 return None
             fault, value = ended

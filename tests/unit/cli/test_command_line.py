@@ -69,6 +69,20 @@ def test_the_help_names_every_shipped_configuration() -> None:
         assert file.stem in EPILOG
 
 
+@pytest.mark.parametrize(
+    ("words", "value"),
+    [
+        (["demo", "--duration", "nan"], "nan"),
+        (["info", "-t", "0"], "0"),
+        (["zero", "j", "--angle", "30 rpm"], "30 rpm"),
+    ],
+)
+def test_a_value_that_the_parser_refuses_is_named(words: list[str], value: str) -> None:
+    shown = subprocess.run([sys.executable, "-m", "jointctl.tools.verbs", *words], capture_output=True, text=True)
+    assert shown.returncode == 2
+    assert re.fullmatch(rf"error: .*{words[-2]}.*(\(={value}\)|'{value}').*\nhint: .*\n", shown.stderr)
+
+
 def test_the_version_is_that_of_the_package() -> None:
     shown = subprocess.run(
         [sys.executable, "-m", "jointctl.tools.verbs", "--version"], capture_output=True, text=True, check=True

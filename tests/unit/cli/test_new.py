@@ -9,11 +9,11 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError, NoDeviceError, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, NoDeviceError, UsageError
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, read_text, shipped_config
 from jointctl.tools.inspection.first_files import checked, eds_of_identity, filled, first_values, marks
@@ -117,11 +117,38 @@ def test_the_file_is_not_asked_for_if_it_exists(tmp_path: Path) -> None:
         new(tmp_path / "mine.toml", output()[0], drive=DriveOptions("none", "none", None, 1))
 
 
+def test_a_folder_that_is_not_there_is_refused_before_the_drive_is_asked(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be written: No such file"):
+        new(tmp_path / "none" / "mine.toml", output()[0], drive=DriveOptions("none", "none", None, 1))
+
+
+def test_nothing_is_left_of_a_file_for_which_the_disk_has_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(path: Path, *_: str, **__: str) -> IO[str]:
+        path.touch()
+        return open("/dev/full", "w")
+
+    monkeypatch.setattr(Path, "open", opened)
+    with pytest.raises(DataError, match="cannot be written: No space left"):
+        new(tmp_path / "mine.toml", output()[0])
+    assert list(tmp_path.iterdir()) == []
+
+
 class Inverting(SdoReader):
     """With an object 607E, which the virtual drive lacks."""
 
     def value(self, index: int, sub: int = 0) -> Any:
         return 0xC0 if index == 0x607E else super().value(index, sub)
+
+
+class Scaling(SdoReader):
+    """With an object 6092, which the virtual drive lacks."""
+
+    feed = (0, 0)
+
+    def value(self, index: int, sub: int = 0) -> Any:
+        return self.feed[sub - 1] if index == 0x6092 else super().value(index, sub)
 
 
 def reader_of(joint: DeviceOnBus) -> Any:
@@ -165,6 +192,24 @@ def test_whose_turns_608f_counts(
     assert found.suggested.get(("joint", "reduction_ratio"), (None,))[0] == ratio
 
 
+@pytest.mark.parametrize(
+    ("feed", "shaft_turns", "taken", "suggested"),
+    [(360_000, 1, None, 360_000), (720_000, 2, None, 360_000), (1, 1, None, None), (8192, 2, 4096, None),
+     (0, 0, 4096, None)],
+)  # fmt: skip
+def test_counts_of_the_encoder_are_not_taken_where_the_drive_scales_its_position(
+    tmp_path: Path, joint: DeviceOnBus, feed: int, shaft_turns: int, taken: int | None, suggested: int | None
+) -> None:
+    joint.answers |= {(0x608F, 1): 4096, (0x608F, 2): 1}
+    with reader_of(joint) as network:
+        reader = Scaling(network, 1)
+        reader.feed = (feed, shaft_turns)
+        found = first_values(reader, tmp_path)
+    place = "encoder", "counts_per_turn"
+    assert (found.known.get(place, (None,))[0], found.suggested.get(place, (None,))[0]) == (taken, suggested)
+    assert any("6092 is" in remark for remark in found.remarks) is (taken is None)
+
+
 def test_the_eds_by_identity(tmp_path: Path) -> None:
     assert eds_of_identity(tmp_path, 1, 0x9A, 16)[0] is None
     (tmp_path / "gold.EDS").write_text(eds_text(GOLD))
@@ -190,7 +235,8 @@ def test_every_marked_line_can_be_filled_and_checked() -> None:
 @pytest.mark.parametrize(
     ("place", "text"),
     [(("encoder", "direction"), "2"), (("encoder", "side"), "shaft"), (("limits", "torque_max_Nm"), "-1"),
-     (("encoder", "counts_per_turn"), "4096.5"), (("drive", "node"), "128"), (("joint", "inertia_kgm2"), "nan")],
+     (("encoder", "counts_per_turn"), "4096.5"), (("drive", "node"), "128"), (("joint", "inertia_kgm2"), "nan"),
+     *((("limits", "torque_max_Nm"), digits * "9") for digits in (400, 5000))],
 )  # fmt: skip
 def test_an_answer_that_may_not_be_is_refused_by_name(place: tuple[str, str], text: str) -> None:
     with pytest.raises(ValueError, match=rf"{place[0]}\.{place[1]} \(={re.escape(text)}\) "):

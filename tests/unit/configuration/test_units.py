@@ -42,6 +42,7 @@ def test_what_has_one_meaning(key: str, text: str, value: float) -> None:
         ("position_max_rad", "30"), ("position_max_rad", "30 rpm"), ("rate_Hz", "1 k"), ("rate_Hz", "1 khz"),
         ("torque_max_Nm", "3 nm"), ("heartbeat_s", "100 m"), ("interface", "1 kHz"), ("bitrate_bitps", "1.5 bit/s"),
         ("rate_Hz", "one kHz"), ("rate_Hz", "1 kHz or so"), ("rate_Hz", "nan kHz"), ("rate_Hz", ""),
+        ("bitrate_bitps", "1e999 kbit/s"), ("max_torque_permille", "1e308 %"),
     ],
 )  # fmt: skip
 def test_what_is_left_alone(key: str, text: str) -> None:

@@ -192,6 +192,9 @@ def test_motions_that_do_not_go_together_are_refused(tmp_path, change, also, mes
 def test_a_further_file_must_be_a_motion(tmp_path):
     data = write_table(tmp_path / "move.csv", motion_columns(seconds=10.0))
     log = run_log(tmp_path / "run.mcap", motion_columns(seconds=10.0))
+    with pytest.raises(DataError, match=r"x\.csv: no such file"):
+        motion_from(log, ForeignFormat(), replace(SETTINGS, also=(tmp_path / "x.csv",)))
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
     with pytest.raises(DataError, match=r"x\.csv: is no motion in time"):
         motion_from(log, ForeignFormat(), replace(SETTINGS, also=(tmp_path / "x.csv",)))
     sweep = plateaus(tmp_path / "s.csv", TrueJoint())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from jointctl.drivers.errors import DeviceError, NoDeviceError
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest
+from tests.places import EDS
 
 # --- Drives as they are met: objects they lack, limits and delays of their own (docs/hardware.md) ---
 pytestmark = pytest.mark.usefixtures("short_timeout")
@@ -115,6 +117,28 @@ def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
 @pytest.mark.parametrize("sub", [1, 2])
 def test_half_an_encoder_resolution_is_none(lacking: Any, sub: int) -> None:
     assert lacking((0x608F, sub)).counts_per_motor_turn == 0.0
+
+
+SCALED = """
+[6091]\nObjectType=8\n[6091sub1]\nDataType=7\n[6091sub2]\nDataType=7
+[6092]\nObjectType=8\n[6092sub1]\nDataType=7\n[6092sub2]\nDataType=7
+"""
+
+
+@pytest.mark.parametrize("mode", [{"mode": "cst"}, OWN_LOOP])
+@pytest.mark.parametrize(
+    ("gear", "feed", "indices"),
+    [((121, 1), (360_000, 1), ["6091", "6092"]), ((1, 1), (524288, 121), []), ((1, 1), (0, 0), [])],
+)
+def test_a_position_that_the_drive_scales_is_told_in_every_mode(
+    commission: Any, joint: Any, mode: Any, gear: Any, feed: Any, indices: list[str]
+) -> None:
+    joint.device.objects.entries |= {
+        (index, sub): replace(joint.device.objects.entries[0x608F, sub], index=index, default=value)
+        for index, values in ((0x6091, gear), (0x6092, feed)) for sub, value in enumerate(values, 1)
+    }  # fmt: skip
+    remarks = commission(eds=EDS.read_text() + SCALED, **mode).remarks
+    assert [line[:4] for line in remarks if line[:4] in ("6091", "6092")] == indices
 
 
 @pytest.mark.parametrize("sub", [1, 2])
