@@ -39,8 +39,8 @@ class DeviceOnBus:
 
     `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
     next requests stay unanswered; `requests` are the frames that came in.  `sequences` are answers used up one by one
-    before the true ones; `refused` are downloads answered with that SDO abort code; `deaf_frames` frames are lost.
-    `settings` are what `opened` gives the driver.
+    before the true ones; `refused` are downloads answered with that SDO abort code, `unread` are uploads; `deaf_frames`
+    frames are lost.  `settings` are what `opened` gives the driver.
     """
 
     def __init__(self, device: Cia402Device | None, settings: CanopenSettings | None = None) -> None:
@@ -50,6 +50,7 @@ class DeviceOnBus:
         self.answers: dict[tuple[int, int], int] = {}
         self.mute: list[tuple[int, int]] = []
         self.refused: dict[tuple[int, int], int] = {}
+        self.unread: dict[tuple[int, int], int] = {}
         self.sequences: dict[tuple[int, int], list[int]] = {}
         self.deaf_frames = 0
         self.requests: list[tuple[int, bytes]] = []
@@ -97,8 +98,9 @@ class DeviceOnBus:
                 if place in self.mute:
                     self.mute.remove(place)
                     continue
-                if data[0] & 0xE0 == 0x20 and place in self.refused:
-                    abort = struct.pack("<BHBI", 0x80, *place, self.refused[place])
+                refused = {0x20: self.refused, 0x40: self.unread}.get(data[0] & 0xE0, {})
+                if place in refused:
+                    abort = struct.pack("<BHBI", 0x80, *place, refused[place])
                     self._reply(_FRAME.pack(0x580 + self.device.settings.node_id, 8, abort))
                     continue
             self.now_ns += 1_000_000

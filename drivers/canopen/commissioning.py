@@ -223,9 +223,13 @@ def _scaled_units(objects: ObjectAccess) -> list[str]:
     """Whether 6064 and 607A are counts of the encoder: a gear ratio (6091) or feed (6092) scales both alike."""
     found = []
     for index, what in ((0x6091, "gear ratio"), (0x6092, "feed constant")):
-        if not (objects.has(index, 1) and objects.has(index, 2)):
+        try:
+            if not (objects.has(index, 1) and objects.has(index, 2)):
+                continue
+            above, below = (objects.read(index, sub, what=what) for sub in (1, 2))
+        except DeviceError as error:
+            found.append(f"whether the drive scales 6064 is not known: {error.message}")
             continue
-        above, below = (objects.read(index, sub, what=what) for sub in (1, 2))
         if index == 0x6091 and above != below:
             found.append(
                 f"6091 is {above}:{below}: the drive scales 6064 and 607A by it; encoder.counts_per_turn and "

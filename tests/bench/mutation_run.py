@@ -34,7 +34,9 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/live_change.py": (
         "firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules", "firmware_py/axis/test_live_*",
     ),
-    "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
+    "firmware_py/sequence.py": (
+        "firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*", "firmware_py/test_cycle",
+    ),
     "drivers/canopen/cia.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/network.py": (
         "drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off", "drivers/canopen/test_arm_drives",

@@ -57,7 +57,7 @@ from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402
 from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
 from jointctl.tools.tuning import carry_out  # noqa: E402
 from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
-from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402  # noqa: E402
+from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402
 from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
 from jointctl.tools.tuning.joint_fit import SMALL_MOTION, Estimate, JointFit, values_of_fit  # noqa: E402
 from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402

@@ -76,11 +76,11 @@ class Started:
 
 
 def processes_in(folder: Path) -> list[int]:
-    """Process ids of all whose working directory is there."""
+    """Process ids of all others whose working directory is there."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # ended in the meantime, or somebody else's
-            if (entry / "cwd").readlink() == folder.resolve():
+            if (entry / "cwd").readlink() == folder.resolve() and int(entry.name) != os.getpid():
                 found.append(int(entry.name))
     return found
 

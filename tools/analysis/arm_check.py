@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,6 +29,8 @@ RATES_Hz = (4000, 2000, 1000, 500, 250, 200, 125, 100)  # that a clock divides w
 MOST_POSES = 3000
 FINE_GRID = 9  # points a joint
 MOTION_SAMPLES = 400  # of a motion whose torques are looked at
+GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
+SHORTEST_SHARE = 1e-4  # of the motion: from there on its beginning is looked at more closely
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,15 @@ def load_torques(arm: ArmConfig) -> None:
     reference_at(new(TrajectoryConstants)[0], np.zeros((1, 5)), 0, 0.0, new(Reference)[0])
 
 
+def moments_s(duration_s: float) -> np.ndarray:
+    """`MOTION_SAMPLES` of them, in order: half spread over the motion, half over ever shorter beginnings of it.
+
+    The steps never repeat, so that none coincides with the period of a sine; a short move with a long rest is seen too.
+    """
+    spread = np.modf(np.arange(1, MOTION_SAMPLES // 2 + 1) * GOLDEN_RATIO)[0]
+    return np.sort(np.concatenate((spread * duration_s, duration_s * SHORTEST_SHARE**spread)))
+
+
 def require_torques(
     arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None]
 ) -> None:
@@ -186,7 +198,7 @@ def require_torques(
     motion: Any = memory.motion
     reference: Any = new(Reference)[0]
     rows = [0] * len(trajectories)
-    times_s = np.linspace(0.0, duration_s, MOTION_SAMPLES)
+    times_s = moments_s(duration_s)
     torques_Nm = np.zeros((len(times_s), len(trajectories)))
     for time_s, torques in zip(times_s, torques_Nm, strict=True):
         alive()
@@ -214,7 +226,9 @@ def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | Non
     ends = found.least_kgm2, found.greatest_kgm2
     if reducer is not None:
         motor = reducer.motor_inertia_kgm2
-        factors = tuple((end - motor) / (inertia - motor) for end in ends)
+        low, high = ((end - motor) / (inertia - motor) for end in ends)
+        known = config.margin.payload_range  # what a single joint must bear, besides
+        factors = min(low, known[0]), max(high, known[1])
         config = config.model_copy(update={"margin": config.margin.model_copy(update={"payload_range": factors})})
         settings, _ = loop_settings(config, delay_s)
     else:
@@ -231,7 +245,8 @@ def require_held(arm: ArmConfig) -> list[PoseRange]:
         if found.gravity_Nm >= config.limits.torque_max_Nm:
             raise ConfigurationError(
                 f"{arm.path}: joint {name}: gravity reaches {found.gravity_Nm:.3g} Nm within the joints' limits, and "
-                f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more"
+                f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more",
+                "or let no joint reach such poses: narrow the limits.position_*_rad",
             )
     return ranges
 

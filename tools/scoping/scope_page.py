@@ -87,14 +87,12 @@ document.addEventListener('keyup', event => {
 (() => {
   let seen = '', at = Date.now()
   setInterval(() => {
-    const beat = byName('beat'), stale = byName('stale'), word = byName('stop-word')
+    const beat = byName('beat'), stale = byName('stale')
     wasConnected ||= Boolean(window.socket?.connected)
-    if (!beat || !stale || !word) return
+    if (!beat || !stale) return
     if (beat.textContent !== seen) { seen = beat.textContent; at = Date.now() }
     const late = Date.now() - at > STALE_MS && !beat.textContent.endsWith('OVER')
     stale.style.display = late ? 'block' : 'none'
-    // it has arrived after all, or there is nothing left to stop
-    if (beat.textContent.endsWith('OVER') && word.textContent === 'NOT_TAKEN') word.textContent = ''
   }, 500)
 })()
 </script>"""

@@ -20,6 +20,7 @@ from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
+from jointctl.firmware_py.safety import ROUNDING_rad
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
@@ -136,7 +137,10 @@ class RunPlan:
         if self.arm is None:
             return self.motion.placed(reports[0])
         joints = self.arm.joints
-        placed = [joint.motion.placed(report) for joint, report in zip(joints, reports, strict=True)]
+        placed = []
+        for joint, report in zip(joints, reports, strict=True):
+            with blamed(joint.name):
+                placed.append(joint.motion.placed(report))
         constants = self.arm.config.connected([each.constants for each in placed])
         lines: list[str] = []
         for axis, joint, report in zip(constants, joints, reports, strict=True):
@@ -340,15 +344,16 @@ class ConfiguredMotion:
         approach = float(axis.sequence.approach_s)
         if approach:
             way = approach_peak(report.start_position_rad, first, approach)
+            low_rad, high_rad = limits.position_min_rad - ROUNDING_rad, limits.position_max_rad + ROUNDING_rad
+            stands_inside = low_rad <= report.start_position_rad <= high_rad  # else the loop says so
             for far_rad in (way.position_min_rad, way.position_max_rad):
-                inside = limits.position_min_rad <= far_rad <= limits.position_max_rad
-                if not inside and far_rad != report.start_position_rad:  # where it stands is the loop's to judge
+                if stands_inside and not low_rad <= far_rad <= high_rad:
                     raise MotionFault(
                         f"the approach from {report.start_position_rad:+.4f} rad in {approach:.1f} s swings to "
                         f"{far_rad:+.4f} rad, must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], "
                         "the limits.position_*_rad",
-                        "begin nearer to the beginning of the motion, of an arm with all joints, or with a motion "
-                        "that begins at rest",
+                        "begin nearer to the beginning of the motion (of an arm with all joints), with a shorter "
+                        "sequence.approach_s where that is a number, or with a motion that begins at rest",
                     )
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"

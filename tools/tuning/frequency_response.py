@@ -293,7 +293,7 @@ class ResponseMotion:
 LEVEL = 0.95
 GOOD_COHERENCE = 0.9
 WORST_RELATIVE = 0.7  # of its interval: such a line says nothing
-LEAST_LEGS = 4
+MEASURED_LEGS = 4
 MOST_LOST = 0.01  # share of the cycles of a leg that were skipped
 TO_SIGMA = 1.4826  # of a median of absolute values
 MEDIAN_LOSS = 1.2533  # standard error of a median over that of a mean
@@ -423,8 +423,10 @@ def response_of(config: Config, plan: ResponsePlan, records: np.recarray) -> Fre
         ):  # fmt: skip
             columns[name].append(np.interp(at, cycle[first:last], np.asarray(values)))
         columns["r"].append(excitation[at % count])
-    if len(columns["u"]) < LEAST_LEGS:
-        raise DataError(f"legs that were measured (={len(columns['u'])}) must be at least {LEAST_LEGS}", "run it again")
+    if len(columns["u"]) < MEASURED_LEGS:
+        raise DataError(
+            f"legs that were measured (={len(columns['u'])}) must be at least {MEASURED_LEGS}", "run it again"
+        )
     sums = {name: fourier_sums(np.array(values), plan.sine.bins) for name, values in columns.items()}
     law, other = sides_of(config)
     channels = {law: _channel(sums["y"], sums["u"], sums["r"])}

@@ -112,7 +112,8 @@ def _refuse_usage(error: Any) -> None:
     if not text:
         return
     if hasattr(error.__cause__, "errors"):  # of pydantic, whose words leave the value out
-        text = text.replace(": Input", f" (={error.__cause__.errors()[0]['input']}): input", 1)
+        value = one_line(str(error.__cause__.errors()[0]["input"]))[:40]
+        text = text.replace(": Input", f" (={value}): input", 1)
     command = error.ctx.command_path if error.ctx is not None else "jointctl"
     Output().error(text[0].lower() + text[1:], f"`{command} --help` shows what there is")
 

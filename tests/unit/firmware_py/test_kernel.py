@@ -439,7 +439,7 @@ PLAIN = (
 )  # fmt: skip
 FULLY_COVERED = (
     "drivers/canopen/cia.py",
-    *(f"firmware_py/{name}.py" for name in ("safety", "sequence", "live_change", "stream")),
+    *(f"firmware_py/{name}.py" for name in ("safety", "sequence", "live_change")),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -23,13 +24,16 @@ from jointctl.drivers.errors import (
     UsageError,
 )
 from jointctl.firmware_py.cycle import Word
+from jointctl.tools.analysis.arm_check import moments_s
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.drive_section import GivenPlace
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.sections import Hold
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_buses
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
-from jointctl.tools.session.plan import blamed, free, resolve_arm
+from jointctl.tools.session.plan import blamed, free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from tests.configurations import changed
@@ -286,3 +290,24 @@ def test_an_exchange_keeps_what_a_cycle_reads_near_and_no_long_arrays() -> None:
             assert not is_near(column[axis, 1:])
     assert 8 * kept.sum() < 3 * 8192
     os.close(block.fd)
+
+
+@pytest.mark.parametrize("limit_rad", [0.7, -0.7])
+def test_an_approach_that_ends_at_a_limit_is_allowed_from_everywhere(limit_rad: float) -> None:
+    """Its polynomial ends there but for rounding."""
+    hold = Hold(kind="hold", duration_s=1.0, position_rad=limit_rad)
+    config = changed(
+        load_config(shipped_config("virtual")), limits__position_min_rad=-0.7, limits__position_max_rad=0.7
+    )
+    plan = resolve(config.model_copy(update={"trajectory": hold}))
+    for start_rad in np.linspace(-0.7, 0.7, 300):
+        plan.placed([report(float(start_rad))])
+
+
+def test_the_torques_of_a_sine_are_not_looked_at_where_it_rests() -> None:
+    """Evenly spread, the moments of 399 periods would all be its ends."""
+    for duration_s in (399.0, 79.8, 60.0):
+        away = np.abs(np.sin(math.tau * moments_s(duration_s)))
+        assert np.max(away) > 0.99
+        assert np.mean(away) > 0.5
+    assert np.sum(moments_s(60.0) < 0.2) > 20

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import replace
 from typing import Any
@@ -139,6 +140,13 @@ def test_a_position_that_the_drive_scales_is_told_in_every_mode(
     }  # fmt: skip
     remarks = commission(eds=EDS.read_text() + SCALED, **mode).remarks
     assert [line[:4] for line in remarks if line[:4] in ("6091", "6092")] == indices
+
+
+def test_a_drive_that_does_not_tell_its_scale_is_commissioned_with_a_remark(commission: Any, joint: Any) -> None:
+    joint.unread.update({(index, sub): 0x08000022 for index in (0x6091, 0x6092) for sub in (1, 2)})
+    remarks = commission(eds=EDS.read_text() + SCALED, mode="cst").remarks
+    told = "\n".join(remarks)
+    assert all(re.search(rf"6064 is not known: .*{index}.* was refused", told) for index in ("6091", "6092")), told
 
 
 @pytest.mark.parametrize("sub", [1, 2])

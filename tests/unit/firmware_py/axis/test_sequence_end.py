@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from jointctl.firmware_py.records import LINE_GONE
+from jointctl.firmware_py.records import LINE_GONE, AxisState
 from jointctl.firmware_py.safety import SINKS_SHARE, check_release, enter
-from jointctl.firmware_py.sequence import ANSWER_CYCLES, released_torque_Nm, step_stopping
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import ANSWER_CYCLES, end_sinking, released_torque_Nm, reset_axis, step_stopping
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Notice, Reaction
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 
@@ -43,6 +45,31 @@ def test_a_joint_that_sinks_while_its_torque_is_released_is_braked_by_its_drive(
     check_release(axis, state)
     assert state.phase == (AxisPhase.QUICK_STOPPING if sinks else phase)
     assert (state.notices, state.fault) == (Notice.SANK if sinks else 0, Fault.NONE)
+
+
+@pytest.mark.parametrize("share", [0.999, 1.001])
+@pytest.mark.parametrize(
+    ("late", "age_cycles", "fault"),
+    [
+        (DriveState.PREPARED, ANSWER_CYCLES, Fault.ENABLE_TIMEOUT),
+        (DriveState.PREPARED, ANSWER_CYCLES + 1, Fault.STALE_SAMPLE),
+        (DriveState.ENABLED, ANSWER_CYCLES, Fault.NONE),
+        (DriveState.ENABLED, ANSWER_CYCLES + 1, Fault.STALE_SAMPLE),
+        (DriveState.ENABLED, 0, Fault.NONE),
+    ],
+)
+def test_a_joint_that_sinks_before_its_start_is_laid_to_the_drive_that_it_waits_for(
+    axis_constants: Any, share: float, late: DriveState, age_cycles: int, fault: Fault
+) -> None:
+    constants, states = np.repeat(axis_constants, 2).view(np.recarray), new(AxisState, 2)
+    for axis, state in zip(constants, states, strict=True):
+        reset_axis(axis, state)
+        state.phase, state.ready = AxisPhase.ENABLING, 1
+    states[0].measured_position_rad = share * SINKS_SHARE * constants[0].limits.following_error_max_rad
+    states[1].sample_age_cycles = age_cycles
+    samples = np.stack([sample_of(DriveState.ENABLED), sample_of(late)]).view(np.recarray)
+    end_sinking(constants, states, samples)
+    assert list(states.fault) == [Fault.NONE, fault if share > 1.0 else Fault.NONE]
 
 
 @pytest.mark.parametrize("drive_state", DriveState)
