@@ -81,12 +81,16 @@ class Tab:
         return str(self.until(f"document.querySelector('[data-testid=\"{name}\"]').innerText"))
 
     def click(self, name: str) -> None:
-        """Press with the mouse, so that only what can be seen can be pressed."""
-        box = self.until(
+        """Press with the mouse, so that only what can be seen can be pressed, once it has come to rest."""
+        where = (
             f"(() => {{ const e = document.querySelector('[data-testid=\"{name}\"]'); e.scrollIntoView({{block: "
             "'center'}); const b = e.getBoundingClientRect(); "
             "return b.width > 0 ? [b.x + Math.min(b.width / 2, 20), b.y + b.height / 2] : null })()"
         )
+        last, box = None, self.until(where)
+        while box != last:  # a page that comes up, or has grown, moves what it shows
+            time.sleep(0.2)
+            last, box = box, self.until(where)
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 

@@ -60,6 +60,7 @@ def pytest_configure() -> None:
     gc.set_threshold(50_000, 20, 10)  # a tenth of the time of tests went into it
     if os.environ.get("NUMBA_DISABLE_JIT") == "1":
         plain_records.use()
+    os.nice = lambda _: 0  # what one test tries would slow down all that follow in its process
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 
 

@@ -300,7 +300,7 @@ def test_an_approach_that_ends_at_a_limit_is_allowed_from_everywhere(limit_rad: 
         load_config(shipped_config("virtual")), limits__position_min_rad=-0.7, limits__position_max_rad=0.7
     )
     plan = resolve(config.model_copy(update={"trajectory": hold}))
-    for start_rad in np.linspace(-0.7, 0.7, 300):
+    for start_rad in np.linspace(-0.7, 0.7, 60):
         plan.placed([report(float(start_rad))])
 
 
