@@ -87,8 +87,8 @@ class Tab:
             "'center'}); const b = e.getBoundingClientRect(); "
             "return b.width > 0 ? [b.x + Math.min(b.width / 2, 20), b.y + b.height / 2] : null })()"
         )
-        last, box = None, self.until(where)
-        while box != last:  # a page that comes up, or has grown, moves what it shows
+        last, box, give_up = None, self.until(where), time.monotonic() + 5.0
+        while box != last and time.monotonic() < give_up:  # a page that comes up, or has grown, moves what it shows
             time.sleep(0.2)
             last, box = box, self.until(where)
         for kind in ("mousePressed", "mouseReleased"):
