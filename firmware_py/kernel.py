@@ -42,6 +42,7 @@ _KERNEL_SOURCES = (
     *(f"{layer}/**/*.py" for layer in ("firmware_py", "drivers", "hil")),
     *(f"tools/{pattern}" for pattern in TOOLS_WITH_KERNELS),
 )
+SLOW_START_S = 2.0  # compiling for so long is told
 _KEPT_CACHES = 4
 
 
@@ -251,6 +252,23 @@ def on_compiling(tell: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         _told.remove(tell)
+
+
+@contextlib.contextmanager
+def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
+    """Tells that `who` compiles, `after_s` after it has begun to, unless what this gives has been called by then."""
+    timer = threading.Timer(after_s, tell, [f"{who}: compiling, which only the first start does"])
+    timer.daemon = True
+
+    def compiling() -> None:
+        if timer.ident is None:
+            timer.start()
+
+    try:
+        with on_compiling(compiling):
+            yield timer.cancel
+    finally:
+        timer.cancel()
 
 
 def plain(function: Function) -> Function:

@@ -16,39 +16,19 @@ import json
 import os
 import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.kernel import on_compiling
+from jointctl.firmware_py.kernel import slow_start
 from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 from jointctl.tools.session.loops import loop_of
 from jointctl.tools.wake_up import cores_awake
 
-SLOW_START_S = 2.0
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
-
-
-@contextmanager
-def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
-    """Tells that `who` compiles, `after_s` after it has begun to, unless what this gives has been called by then."""
-    timer = threading.Timer(after_s, tell, [f"{who}: compiling, which only the first start does"])
-    timer.daemon = True
-
-    def compiling() -> None:
-        if timer.ident is None:
-            timer.start()
-
-    try:
-        with on_compiling(compiling):
-            yield timer.cancel
-    finally:
-        timer.cancel()
 
 
 def _block_signals() -> None:

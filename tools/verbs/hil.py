@@ -90,12 +90,12 @@ def serve_can(
     live: ObserveOptions = NOBODY,
 ) -> int:
     """Serve until a stop signal; `ready_fd` gets `BUS` and `DRIVE` in time, and its reader's end ends us."""
+    from jointctl.firmware_py.kernel import slow_start
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.configuration.config import Config, first_on_bus
     from jointctl.tools.session.control import stop_signals
-    from jointctl.tools.session.loop_process import slow_start
     from jointctl.tools.virtual_joint import serve_virtual_joint
 
     joints = [given] if isinstance(given, Config) else list(given.joints)

@@ -63,9 +63,9 @@ def tracked(
     own: OwnVirtualJoint | None = None,
 ) -> int:
     """`run` from Python; `own`: the virtual joint that was started for it, and may still be starting."""
+    from jointctl.firmware_py.kernel import slow_start
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.loop_process import slow_start
     from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session

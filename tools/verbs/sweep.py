@@ -152,11 +152,11 @@ class Sweep:
 
     def _measure(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float) -> str | None:
         """Visit the points; the name of the signal that stopped it or "", None if it was declined or a dry run."""
+        from jointctl.firmware_py.kernel import slow_start
         from jointctl.firmware_py.states import Fault
         from jointctl.tools.configuration.conversions import torque_constant_NmpA
         from jointctl.tools.session.display import Displays, PhaseLines
         from jointctl.tools.session.fault_words import fault_text
-        from jointctl.tools.session.loop_process import slow_start
         from jointctl.tools.session.session import Session
         from jointctl.tools.sweeping.carry_out import (
             MeterDisplay,

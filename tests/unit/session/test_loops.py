@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import BusError
-from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import kernel, slow_start
 from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_time_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
@@ -26,7 +26,6 @@ from jointctl.tools.output import Output
 from jointctl.tools.session import elmo_drive as module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
-from jointctl.tools.session.loop_process import slow_start
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from tests.places import CONFIGS, ROOT
