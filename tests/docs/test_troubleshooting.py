@@ -16,7 +16,7 @@ GAP = "…"
 def printed_texts() -> list[str]:
     """Every text in the sources, with a gap where a value goes."""
     found = []
-    for folder in ("drivers", "tools", "hil"):
+    for folder in ("drivers", "firmware_py", "hil", "interface", "tools"):
         for file in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.JoinedStr):
