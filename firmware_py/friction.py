@@ -48,7 +48,7 @@ from jointctl.firmware_py.records import (
     LuGreConstants,
 )
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import ZeroSpeedRule
+from jointctl.firmware_py.states import ControllerKind, ZeroSpeedRule
 
 # --- Multi-stage friction model (11): Stribeck near zero speed, a cubic polynomial beyond the knee ---
 
@@ -271,6 +271,12 @@ def step_lugre(
 # What it adds after a move has ended is therefore handed over to the bristles, which hold it until they slide
 # (`take_at_rest`).
 #
+# Where a move has ended the bristles are near their limit, and creep on in its direction with every count of the
+# encoder and every Nm that is fed forward too much.  They have to be let go: by as much as the joint is seen to go on,
+# and of a joint that is not rigid, whose gains are too low to hold it, by half at once.  They spring back by what they
+# were let go of, which is elastic and small (`_let_go`).  Of such a joint the observer is slow as well: what it has
+# found on arrival is mostly friction of this direction.  It keeps the mean of both directions, which is a load.
+#
 # Bounded by construction: bristles in parallel, none of them negative, that together have at most `reach` more or less
 # than the configured friction in either direction, and sines of at most `ripple_max_Nm`.  Not modelled: friction that
 # depends on the position.
@@ -282,6 +288,12 @@ SINES = 2 * BRISTLES  # the first part that is one
 MOST = 1.2  # that a kind of bristles may weigh
 LEAST_SHARE = 0.5  # of the bristles that take something over
 TAKEN_radps = 20.0  # slow: with a reducer that is not rigid, friction moves the desired motor angle as well
+LET_GO = 5.0  # by how many times the configured stiffness the bristles give way to a joint that goes on
+TURNING_CYCLES = 4  # a motion that turns back rests for one
+MOST_LET_GO = 0.8  # of what they held when the motion came to rest
+AT_ONCE, AT_ONCE_s = 0.5, 0.03  # of a joint that is not rigid, in this time
+AVERAGED_s = 1.0  # of the observer's torque in one direction
+LEAST_MOVED_s = 0.3  # in each direction, before their mean counts
 EVERY = 10  # cycles between two steps of the regression
 STILL_radps = 1e-4  # below this desired speed the parts say nothing
 NOISE_Nm = 5.0  # of the regression: what friction and ripple do not explain, and its samples are not independent
@@ -315,6 +327,8 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState, lin
     state.seen_motor.primed = state.seen_link.primed = 0
     state.seen_fed_Nm = 0.0
     state.link_share = state.used_link_share = link_share
+    for side in range(2):
+        state.mean_disturbance_Nm[side] = state.moved_s[side] = 0.0
     state.twist_offset_rad = 0.0
     state.twist_covariance[0, 0], state.twist_covariance[1, 1] = OFFSET_VARIANCE_rad2, SHARE_VARIANCE
     state.twist_covariance[0, 1] = state.twist_covariance[1, 0] = 0.0
@@ -362,14 +376,58 @@ def adapted_feed_forward_Nm(
 
 
 @kernel
-def take_at_rest(law: LawConstants, state: AdaptationState, disturbance_Nm: float, desired_radps: float) -> float:
+def _held_Nm(law: LawConstants, state: AdaptationState) -> float:
+    """What the bristles of the desired motion hold."""
+    held = 0.0
+    for k in range(BRISTLES):
+        torque = STIFFNESS[k] * law.lugre.stiffness_Nmprad * state.desired_deflection_rad[k]
+        held += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
+    return held
+
+
+@kernel
+def _let_go(law: LawConstants, state: AdaptationState, error_rad: float) -> None:
+    """Let the bristles go where the joint goes on after the move, never more than `MOST_LET_GO` of what they held."""
+    held = _held_Nm(law, state)
+    size, began = abs(held), abs(state.rest_friction_Nm)
+    if held * state.rest_friction_Nm <= 0.0:
+        return
+    wanted_Nm = 0.0
+    beyond_rad = math.copysign(error_rad, error_rad * held) - state.rest_error_rad
+    if beyond_rad > 0.0:
+        state.rest_error_rad += beyond_rad
+        wanted_Nm = LET_GO * law.lugre.stiffness_Nmprad * beyond_rad
+    if law.kind == ControllerKind.FLEXIBLE_JOINT and (state.resting - TURNING_CYCLES) * law.period_s <= AT_ONCE_s:
+        wanted_Nm += AT_ONCE * began * law.period_s / AT_ONCE_s
+    left = max(size - wanted_Nm, min(size, (1.0 - MOST_LET_GO) * began))
+    for k in range(BRISTLES):
+        state.desired_deflection_rad[k] *= left / size
+        state.deflection_rad[k] = state.desired_deflection_rad[k]
+
+
+@kernel
+def take_at_rest(
+    law: LawConstants, state: AdaptationState, disturbance_Nm: float, desired_radps: float, error_rad: float
+) -> float:
     """What the bristles take over from the observer [Nm]; 0 while the desired motion goes on."""
     if abs(desired_radps) >= STILL_radps:
         state.resting = 0
+        side = 0 if desired_radps > 0.0 else 1
+        state.moved_s[side] = min(state.moved_s[side] + law.period_s, AVERAGED_s)
+        newer_Nm = disturbance_Nm - state.mean_disturbance_Nm[side]
+        state.mean_disturbance_Nm[side] += law.period_s / state.moved_s[side] * newer_Nm
         return 0.0
     if state.resting == 0:
-        state.resting = 1
         state.rest_disturbance_Nm = disturbance_Nm
+        if law.kind == ControllerKind.FLEXIBLE_JOINT and min(state.moved_s[0], state.moved_s[1]) > LEAST_MOVED_s:
+            state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
+        state.rest_friction_Nm = _held_Nm(law, state)
+        state.rest_error_rad = max(math.copysign(error_rad, error_rad * state.rest_friction_Nm), 0.0)
+    if (state.resting - TURNING_CYCLES) * law.period_s <= AT_ONCE_s:
+        state.resting += 1
+    if state.resting <= TURNING_CYCLES:
+        return 0.0
+    _let_go(law, state, error_rad)
     wanted_Nm = TAKEN_radps * law.period_s * (disturbance_Nm - state.rest_disturbance_Nm)
     side = 0 if wanted_Nm >= 0.0 else 1
     branch = law.friction.positive if wanted_Nm >= 0.0 else law.friction.negative

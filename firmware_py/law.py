@@ -374,11 +374,11 @@ def _friction_Nm(
 
 @kernel
 def _adapt(
-    constants: LawConstants, state: LawState, desired_radps: float, position_rad: float, error_rate_radps: float,
-    transmitted_Nm: float,
+    constants: LawConstants, state: LawState, desired_radps: float, position_rad: float, error_rad: float,
+    error_rate_radps: float, transmitted_Nm: float,
 ) -> None:  # fmt: skip
     """Adapt the friction to what the observer has found; at rest, give it what the observer has added."""
-    taken_Nm = take_at_rest(constants, state.adaptation, state.observer_torque_Nm, desired_radps)
+    taken_Nm = take_at_rest(constants, state.adaptation, state.observer_torque_Nm, desired_radps, error_rad)
     state.friction_torque_Nm += taken_Nm
     add_to_disturbance(constants.observer, state.observer, -taken_Nm)
     state.observer_torque_Nm = state.observer.disturbance_Nm
@@ -492,7 +492,7 @@ def step_law(
     state.observer.speed_radps += constants.period_s / AVERAGE_s * faster_radps
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity_radps, sent_torque_Nm)
     if constants.adaptation.enabled != 0:
-        _adapt(constants, state, reference.velocity_radps, position_rad, error_rate, transmitted_Nm)
+        _adapt(constants, state, reference.velocity_radps, position_rad, error, error_rate, transmitted_Nm)
         rest_Nm = state.observer_torque_Nm
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
@@ -580,7 +580,8 @@ def step_flexible_law(
             rate_seen_radps = seen.seen_motor.error_rate_radps
             if reading.gap_cycles > 0 and seen.cycle == 0 and abs(moving_radps) >= STILL_radps:
                 adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
-        _adapt(constants, state, moving_radps, own.target_rad + motor_rad, rate_seen_radps, transmitted_Nm)
+        read_rad = own.target_rad + motor_rad
+        _adapt(constants, state, moving_radps, read_rad, motor_rad, rate_seen_radps, transmitted_Nm)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

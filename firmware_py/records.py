@@ -122,8 +122,12 @@ class AdaptationState:
     fed_filtered_Nm: f8
     fed_Nm: Annotated[np.ndarray, array_of(f8, FED_HISTORY)]
     newest: i4  # in it
-    rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
-    resting: i4
+    mean_disturbance_Nm: Annotated[np.ndarray, array_of(f8, 2)]  # the observer's, of each direction
+    moved_s: Annotated[np.ndarray, array_of(f8, 2)]  # in each direction
+    rest_disturbance_Nm: f8  # of the observer's, what it keeps at rest
+    rest_friction_Nm: f8  # of the bristles, when the desired motion came to rest
+    rest_error_rad: f8  # the furthest in the direction of that torque since
+    resting: i4  # cycles since, 0 while it goes on
     cycle: i4
     # of a joint that is not rigid with both encoders, see `flexible_joint`
     seen_motor: VelocityState  # of whose errors the rates count
