@@ -58,11 +58,13 @@ LAWS: dict[str, dict[str, Any]] = {
     "both encoders": {},
     "learning": {"learning": LEARNING},
     "adaptation": {"adaptation": ADAPTATION},
+    "learning and adaptation": {"learning": LEARNING, "adaptation": ADAPTATION},
 }
 MOTIONS: dict[str, tuple[Scenario, ...]] = {
     "both encoders": ("sine", "multi_sine", "point_to_point", "reversals"),
     "learning": ("sine",),
     "adaptation": ("sine", "multi_sine", "point_to_point", "reversals"),
+    "learning and adaptation": ("sine",),
 }
 
 
@@ -158,7 +160,7 @@ def report(rows: list[Row]) -> None:
     print("largest |S|:", _text([row.largest_s for row in first]))
     stable = sum(1 for row in first if math.isfinite(row.half_link_s))
     print(f"stable with half of the link's inertia: {stable}")
-    print("learning, factor of a repetition:", _text([row.convergence for row in rows if row.law == "learning"]))
+    print("learning, factor of a repetition:", _text([row.convergence for row in rows if "learning" in row.law]))
 
 
 def main() -> None:
