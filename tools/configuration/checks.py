@@ -175,8 +175,7 @@ def _control_problems(config: Config) -> list[str]:
     if control.observer_paired and (control.kind != "computed_torque_observer" or control.velocity_filter == "kalman"):
         found.append(
             'control.observer_paired (=true) needs control.kind "computed_torque_observer" '
-            f'(={control.kind}) with control.velocity_filter "low_pass" (={control.velocity_filter}), '
-            "without [control.adaptation]"
+            f'(={control.kind}) with control.velocity_filter "low_pass" (={control.velocity_filter})'
         )
     if control.kind != "pid" and control.ki:
         found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')

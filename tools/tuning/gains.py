@@ -401,14 +401,16 @@ def _control(config: Config, control: Control) -> Control:
         feed_forward = "none"
     elif config.friction.lugre is None and feed_forward == "lugre_desired":
         feed_forward = "desired"
-    adaptation = None
-    if control.kind == "flexible_joint" and feed_forward == "lugre_desired":
+    adaptation, paired = None, False
+    observes = control.kind in ("computed_torque_observer", "flexible_joint")
+    if observes and feed_forward == "lugre_desired":
         adaptation = config.control.adaptation or Adaptation()
+        paired = control.kind != "flexible_joint"  # which pairs anyway
     update: dict[str, Any] = {
         "feed_forward": feed_forward, "feed_forward_lead_s": 0.0 if feed_forward == "none" else round(late_s, 6),
-        "adaptation": adaptation,
+        "adaptation": adaptation, "observer_paired": paired,
     }  # fmt: skip
-    if control.kind in ("computed_torque_observer", "flexible_joint"):
+    if observes:
         update["observer_delay_cycles"] = min(max(round(late_s * config.loop.rate_Hz), 1), 15)
         update["learning"] = control.learning or config.control.learning
     return control.model_copy(update=update)

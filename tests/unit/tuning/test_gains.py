@@ -47,6 +47,13 @@ def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> N
         assert judged.sensitivity_peak < SENSITIVITY + 0.02
     if found.control.learning is not None:
         assert learning_convergence(settings, found.control.learning).worst_factor < 1.0
+    adapts = law == "precise"  # the paper's law has no observer to learn from
+    assert (found.control.adaptation is not None) == found.control.observer_paired == adapts
+
+
+def test_friction_without_bristles_adapts_to_nothing() -> None:
+    fit = fit_of(2.0, 1.5e-3)
+    assert choose_gains(known(shipped("precise", friction__lugre=None), fit), fit, "precise").control.adaptation is None
 
 
 def test_more_delay_leaves_less_and_a_quiet_loop_is_quieter() -> None:
