@@ -27,11 +27,12 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from jointctl.firmware_py import machine_code
+from jointctl.firmware_py.slow_start import compiling
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -42,7 +43,6 @@ _KERNEL_SOURCES = (
     *(f"{layer}/**/*.py" for layer in ("firmware_py", "drivers", "hil")),
     *(f"tools/{pattern}" for pattern in TOOLS_WITH_KERNELS),
 )
-SLOW_START_S = 2.0  # compiling for so long is told
 _KEPT_CACHES = 4
 
 
@@ -103,7 +103,6 @@ class _Here(threading.local):
 _here = _Here()
 _lock = threading.RLock()
 _shared: list[Callable[..., Any]] = []
-_told: list[Callable[[], object]] = []  # when something is compiled
 _compiler_module: ModuleType | None = None
 
 
@@ -176,9 +175,8 @@ class Kernel:
                 if path is not None:
                     code = machine_code.read(path)
                 if code is None:
-                    for tell in _told:
-                        tell()
-                    code = _compiler().compiled(self, arguments)
+                    with compiling():
+                        code = _compiler().compiled(self, arguments)
                     if path is not None:
                         with contextlib.suppress(OSError):  # a disk that takes no more costs the next start some time
                             machine_code.write(path, code)
@@ -242,33 +240,6 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     The caller keeps the arrays, whose contents may change between two calls.
     """
     return function.bound(*arguments) if isinstance(function, Kernel) else functools.partial(function, *arguments)
-
-
-@contextlib.contextmanager
-def on_compiling(tell: Callable[[], object]) -> Iterator[None]:
-    """`tell` is called when a kernel is compiled inside, for each; not for those that come from the cache."""
-    _told.append(tell)
-    try:
-        yield
-    finally:
-        _told.remove(tell)
-
-
-@contextlib.contextmanager
-def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
-    """Tells that `who` compiles, `after_s` after it has begun to, unless what this gives has been called by then."""
-    timer = threading.Timer(after_s, tell, [f"{who}: compiling, which only the first start does"])
-    timer.daemon = True
-
-    def compiling() -> None:
-        if timer.ident is None:
-            timer.start()
-
-    try:
-        with on_compiling(compiling):
-            yield timer.cancel
-    finally:
-        timer.cancel()
 
 
 def plain(function: Function) -> Function:

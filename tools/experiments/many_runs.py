@@ -42,10 +42,11 @@ class Workers:
 
     def results(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
         """`function` of each task, in the order in which they are done; closing it ends the work early."""
-        if self.cluster is None and self.count == 1:
-            yield from map(function, tasks)
-            return
         left = iter(tasks)
+        if self.cluster is None:  # what the first one compiles the processes load, and only here can it be told
+            yield from map(function, left if self.count == 1 else islice(left, 1))
+            if self.count == 1:
+                return
         with self._executor() as (executor, at_once):
             pending: set[Future[Result]] = set()
             while True:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.kernel import slow_start
+from jointctl.firmware_py.slow_start import slow_start
 from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 from jointctl.tools.session.loops import loop_of
 from jointctl.tools.wake_up import cores_awake
@@ -68,8 +68,7 @@ def run(order: LoopOrder) -> int:
         print(text, file=sys.stderr, flush=True)
 
     gc.disable()
-    with slow_start(tell, "loop") as started, loop(order, block) as ready:
-        started()
+    with slow_start(tell, "loop"), loop(order, block) as ready:
         gc.freeze()
         for line in become_realtime(order.cpu, order.priority):
             print(f"loop: {line}", file=sys.stderr, flush=True)

@@ -90,7 +90,6 @@ def serve_can(
     live: ObserveOptions = NOBODY,
 ) -> int:
     """Serve until a stop signal; `ready_fd` gets `BUS` and `DRIVE` in time, and its reader's end ends us."""
-    from jointctl.firmware_py.kernel import slow_start
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
@@ -101,11 +100,9 @@ def serve_can(
     joints = [given] if isinstance(given, Config) else list(given.joints)
     config = joints[0]
     with (
-        slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
         serve_virtual_joint(given, timing, None if ready_fd is None else partial(say, ready_fd, BUS)) as joint,
     ):
-        started()
         make_realtime(config, output)
         buses = first_on_bus(joints)
         parts = []

@@ -41,7 +41,18 @@ from jointctl.tools.verbs.study import study_verb
 from jointctl.tools.verbs.sweep import sweep
 from jointctl.tools.verbs.tune import tune
 from jointctl.tools.verbs.validate import validate
-from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, Verb, Verbs, grouped
+from jointctl.tools.verbs.verb_options import (
+    BEGIN,
+    COMPARE,
+    FRICTION,
+    INSPECT,
+    LOOK,
+    MOVE,
+    Verb,
+    Verbs,
+    grouped,
+    verb_name,
+)
 from jointctl.tools.verbs.zero import zero
 
 TRACEBACK = "JOINTCTL_TRACEBACK"  # in the environment: show where an unexpected error comes from
@@ -86,8 +97,7 @@ for _panel, _verbs in (
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):
     for _verb in _verbs:
-        _name = _verb.__name__.removesuffix("_verb").replace("_", "-")
-        app.command(_name, cls=Verb, rich_help_panel=_panel)(grouped(_verb))
+        app.command(verb_name(_verb), cls=Verb, rich_help_panel=_panel)(grouped(_verb))
 app.add_typer(params_app, name="params", rich_help_panel=INSPECT)
 app.add_typer(log_app, name="log", rich_help_panel=LOOK)
 

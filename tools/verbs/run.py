@@ -63,7 +63,6 @@ def tracked(
     own: OwnVirtualJoint | None = None,
 ) -> int:
     """`run` from Python; `own`: the virtual joint that was started for it, and may still be starting."""
-    from jointctl.firmware_py.kernel import slow_start
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve_any
@@ -72,8 +71,7 @@ def tracked(
 
     if not (assume_yes or dry_run):
         require_terminal()
-    with slow_start(output.note, "model of the arm"):
-        plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
+    plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
         _displays(plan, output, run_title(config), scope) as display,

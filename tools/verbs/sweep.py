@@ -152,7 +152,6 @@ class Sweep:
 
     def _measure(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float) -> str | None:
         """Visit the points; the name of the signal that stopped it or "", None if it was declined or a dry run."""
-        from jointctl.firmware_py.kernel import slow_start
         from jointctl.firmware_py.states import Fault
         from jointctl.tools.configuration.conversions import torque_constant_NmpA
         from jointctl.tools.session.display import Displays, PhaseLines
@@ -186,8 +185,7 @@ class Sweep:
                 self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
 
         if options.lockstep:
-            with slow_start(self.output.note, "simulation"):
-                ended = sweep_in_lockstep(swept, meter, self._consent, begin)
+            ended = sweep_in_lockstep(swept, meter, self._consent, begin)
             if ended is None:
                 return None
             fault, value = ended

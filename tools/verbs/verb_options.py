@@ -14,7 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial, wraps
 from importlib import resources
@@ -26,6 +26,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from jointctl.drivers.errors import UsageError
+from jointctl.firmware_py.slow_start import slow_start
 from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
@@ -342,4 +343,18 @@ def _collect(
         else:
             options.append(parameter.replace(annotation=annotation, kind=inspect.Parameter.KEYWORD_ONLY))
             values[parameter.name] = itemgetter(parameter.name)
-    return lambda given: function(**{name: value(given) for name, value in values.items()})
+
+    def call(given: dict[str, Any]) -> Any:
+        found = {name: value(given) for name, value in values.items()}
+        with ExitStack() as stack:
+            for output in found.values():
+                if isinstance(output, Output):
+                    stack.enter_context(slow_start(output.note, verb_name(function)))
+            return function(**found)
+
+    return call
+
+
+def verb_name(verb: Callable[..., Any]) -> str:
+    """As on the command line."""
+    return verb.__name__.removesuffix("_verb").replace("_", "-")

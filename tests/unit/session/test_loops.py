@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import signal
@@ -16,18 +17,23 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 
 from jointctl.drivers.errors import BusError
-from jointctl.firmware_py.kernel import kernel, slow_start
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.slow_start import compiling, slow_start
 from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_time_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.output import Output
 from jointctl.tools.session import elmo_drive as module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.verbs import verb_options
+from jointctl.tools.verbs.verb_options import VerbOutput, grouped
 from tests.places import CONFIGS, ROOT
 
 
@@ -43,23 +49,46 @@ def compile_something() -> None:
 
 
 def test_a_slow_start_is_told_once() -> None:
-    told = threading.Event()
-    with slow_start(lambda _: told.set(), "loop", 0.01):
-        assert not told.wait(0.1)  # nothing compiles
+    told: list[str] = []
+    with slow_start(told.append, "loop", 0.0):
+        time.sleep(0.1)
+        assert told == []  # nothing compiles
         compile_something()
-        assert told.wait(10.0)
+        compile_something()
+    assert told == ["loop: compiling, which only the first start does"]
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_quick_one_is_not_nor_one_that_fails(fails: bool) -> None:
+def test_what_works_on_after_a_short_compilation_is_not_nor_what_fails(fails: bool) -> None:
     told = threading.Event()
-    with contextlib.suppress(ValueError), slow_start(lambda _: told.set(), "loop", 0.2) as started:
-        compile_something()
+    with contextlib.suppress(ValueError), slow_start(lambda _: told.set(), "loop", 0.2):
+        with compiling():
+            pass
         if fails:
             raise ValueError
-        started()
         assert not told.wait(0.4)
     assert not told.wait(0.4)
+
+
+def one_that_compiles(*, output: VerbOutput) -> None:
+    compile_something()
+
+
+def test_every_verb_says_that_it_compiles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(verb_options, "slow_start", functools.partial(slow_start, after_s=0.0))
+    with pytest.raises(typer.Exit):
+        grouped(one_that_compiles)(json=False, quiet=False)
+    assert capsys.readouterr().err == "one-that-compiles: compiling, which only the first start does\n"
+
+
+def own_process(_: int) -> int:
+    return os.getpid()
+
+
+def test_of_many_runs_the_first_compiles_where_it_can_be_said() -> None:
+    first, *others = Workers(2).results(own_process, range(3))
+    assert first == os.getpid()
+    assert first not in others
 
 
 # --- Waiting for a process that compiles: as long as it works, and in words when it ends or hangs ---
