@@ -108,6 +108,13 @@ def object_name(index: int, sub: int = 0) -> str:
     return f"{index:04X}:{sub}" if sub else f"{index:04X}"
 
 
+def value_text(index: int, sub: int, value: int) -> str:
+    """As it is read: COB-IDs, and objects that are mapped into a PDO, in hexadecimal."""
+    cob_id = index == 0x1005 or (sub == 1 and (0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00))
+    mapped = sub > 0 and (0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00)
+    return f"{value & 0xFFFFFFFF:08X}h" if cob_id or mapped else str(value)
+
+
 class ObjectAccess:
     """Typed access to one node's object dictionary."""
 
@@ -232,7 +239,8 @@ class ObjectAccess:
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
         data = self._encoded(self._required(index, sub, what), value, what)
-        self._transfer(lambda: download(self._node.sdo, index, sub, data), f"writing {value} to", index, sub, what)
+        action = f"writing {value_text(index, sub, value)} to"
+        self._transfer(lambda: download(self._node.sdo, index, sub, data), action, index, sub, what)
 
     def _transfer(self, transfer: Callable[[], Result], action: str, index: int, sub: int, what: str) -> Result:
         """ATTEMPTS for an answer that does not come; more where the answer was to another master's request."""
@@ -258,11 +266,13 @@ class ObjectAccess:
         except DeviceError:
             if self.read(index, sub, what=what) != value:
                 raise
-            self.remarks.append(f"{object_name(index, sub)} ({what}) cannot be written; it is {value}, as it must be")
+            shown = value_text(index, sub, value)
+            self.remarks.append(f"{object_name(index, sub)} ({what}) cannot be written; it is {shown}, as it must be")
         found = self.read(index, sub, what=what)
         if found != value:
             place = f"node {self._node.id}: object {object_name(index, sub)} ({what})"
-            raise DeviceError(f"{place} reads back {found}, {value} was written")
+            read, written = (value_text(index, sub, each) for each in (found, value))
+            raise DeviceError(f"{place} reads back {read}, {written} was written")
         self._verified[index, sub] = value, what
         return found
 
@@ -309,7 +319,7 @@ class ObjectAccess:
             if found != value:
                 raise DeviceError(
                     f"node {self._node.id} has changed since it was commissioned: object {object_name(index, sub)} "
-                    f"({what}) is {found}, {value} was set",
+                    f"({what}) is {value_text(index, sub, found)}, {value_text(index, sub, value)} was set",
                     hint="it was restarted, or another program has used it; start the run again",
                 )
 

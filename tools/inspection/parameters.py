@@ -285,7 +285,7 @@ def write_value(reader: SdoReader, place: Place, value: Value) -> str:
     if isinstance(found, Refusal):
         return f"written, but not read back: {found}"
     value_read = reader.objects.value(place.index, place.sub, found)
-    return "" if value_read == value else f"reads back {value_read}"
+    return "" if value_read == value else f"reads back {reader.objects.text(place.index, place.sub, found)}"
 
 
 def _download(reader: SdoReader, place: Place, data: bytes) -> str:
