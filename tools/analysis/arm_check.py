@@ -238,16 +238,23 @@ def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | Non
     return JointOfArm(name, config, found, settings, margins(settings))
 
 
+def not_held(arm: ArmConfig, ranges: Sequence[PoseRange]) -> Iterator[str]:
+    """Joints whose torque gravity exceeds in poses within the limits."""
+    for name, config, found in zip(arm.names, arm.joints, ranges, strict=True):
+        if found.gravity_Nm >= config.limits.torque_max_Nm:
+            yield (
+                f"joint {name}: gravity reaches {found.gravity_Nm:.3g} Nm within the joints' limits, and "
+                f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more"
+            )
+
+
 def require_held(arm: ArmConfig) -> list[PoseRange]:
     """The ranges of the poses within the limits; `ConfigurationError` where gravity exceeds a joint's torque."""
     ranges = pose_ranges(arm)
-    for name, config, found in zip(arm.names, arm.joints, ranges, strict=True):
-        if found.gravity_Nm >= config.limits.torque_max_Nm:
-            raise ConfigurationError(
-                f"{arm.path}: joint {name}: gravity reaches {found.gravity_Nm:.3g} Nm within the joints' limits, and "
-                f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more",
-                "or let no joint reach such poses: narrow the limits.position_*_rad",
-            )
+    for problem in not_held(arm, ranges):
+        raise ConfigurationError(
+            f"{arm.path}: {problem}", "or let no joint reach such poses: narrow the limits.position_*_rad"
+        )
     return ranges
 
 

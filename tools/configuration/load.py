@@ -103,7 +103,8 @@ def read_document(path: Path) -> tuple[str, dict[str, Any]]:
 def _line_of(text: str, problem: str) -> str:
     """`: kp = `, the line that a message of the TOML reader names by its number; "" where it names none."""
     found, lines = re.search(r"at line (\d+)", problem), text.splitlines()
-    return f": {lines[int(found[1]) - 1].strip()}" if found is not None and int(found[1]) <= len(lines) else ""
+    line = lines[int(found[1]) - 1].strip() if found is not None and int(found[1]) <= len(lines) else ""
+    return f": {line}{decimal_point(line.partition('=')[2].partition('#')[0])}" if line else ""
 
 
 def config_of(path: Path, text: str, data: dict[str, Any]) -> Config:
@@ -186,6 +187,12 @@ def understood(key: str, text: str) -> float | int | None:
     if unit not in WHOLE:
         return value
     return round(value) if math.isfinite(value) and abs(value - round(value)) < 1e-6 else None
+
+
+def decimal_point(text: str) -> str:
+    """What there is to say of a number with a decimal comma; "" of all else."""
+    match = re.fullmatch(r"\s*([-+]?)(\d*),(\d+(?:[eE][-+]?\d+)?(?:\s*[^\d\s,].*)?)", text.rstrip())
+    return f"; with a decimal point: {match[1]}{match[2] or 0}.{match[3]}" if match else ""
 
 
 def echo(key: str, text: str, value: float) -> str:

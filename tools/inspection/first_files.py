@@ -23,12 +23,20 @@ from pydantic.fields import FieldInfo
 from jointctl.drivers.canopen.eds import EdsFile, read_eds
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml
-from jointctl.tools.analysis.arm_check import BusBudget, JointOfArm, RATES_Hz, bus_budgets, joint_loop, pose_ranges
+from jointctl.tools.analysis.arm_check import (
+    BusBudget,
+    JointOfArm,
+    RATES_Hz,
+    bus_budgets,
+    joint_loop,
+    not_held,
+    pose_ranges,
+)
 from jointctl.tools.configuration.arm import LARGEST_ARM, SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.checks import range_problems
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.drive_section import section_class
-from jointctl.tools.configuration.load import echo, understood, unit_of, unit_text
+from jointctl.tools.configuration.load import decimal_point, echo, understood, unit_of, unit_text
 from jointctl.tools.configuration.urdf import Urdf, UrdfJoint, bodies_of, read_urdf
 from jointctl.tools.inspection.drive_info import MAXON, MILLI, rated_torque_mNm
 from jointctl.tools.inspection.subject import SdoReader
@@ -147,7 +155,8 @@ def checked(place: Place, text: str) -> tuple[Any, str]:
         TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False)).validate_python(value)
     except ValidationError as error:
         message = error.errors(include_url=False)[0]["msg"]
-        raise ValueError(f"{section}.{key} (={text}) {message[0].lower()}{message[1:]}") from None
+        hint = decimal_point(text) if "number" in message else ""
+        raise ValueError(f"{section}.{key} (={text}) {message[0].lower()}{message[1:]}{hint}") from None
     return value, echo(key, text, number) if number is not None else ""
 
 
@@ -522,7 +531,7 @@ def first_arm(
             draft = replace(draft, rate_Hz=rate_Hz, inertias_kgm2=inertias)
             arm = draft.loaded(trial)
             ranges = pose_ranges(arm)
-            remarks: list[str] = []
+            remarks = list(not_held(arm, ranges))
             gains = []
             for i, config in enumerate(arm.joints):
                 found = next((g for g in _GAINS if _bears(joint_loop(arm.names[i], _with(config, g), ranges[i]))), None)

@@ -122,8 +122,11 @@ def _refuse_usage(error: Any) -> None:
     if not text:
         return
     if hasattr(error.__cause__, "errors"):  # of pydantic, whose words leave the value out
+        from jointctl.tools.configuration.load import decimal_point  # takes its time
+
         value = one_line(str(error.__cause__.errors()[0]["input"]))[:40]
         text = text.replace(": Input", f" (={value}): input", 1)
+        text += decimal_point(value) if "valid number" in text else ""
     command = error.ctx.command_path if error.ctx is not None else "jointctl"
     Output().error(text[0].lower() + text[1:], f"`{command} --help` shows what there is")
 

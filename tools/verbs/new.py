@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -79,7 +79,8 @@ def new(
     with writing(path), TemporaryFile(dir=path.parent):  # before anything is asked
         pass
     if drive != NOBODY:
-        text = filled(text, _from_drive(drive, text, path.parent, output, ask=not no_input))
+        with _nothing_written():
+            text = filled(text, _from_drive(drive, text, path.parent, output, ask=not no_input))
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -96,6 +97,15 @@ def new(
     elif drive != NOBODY:
         output.note(f"next: jointctl doctor {path}, then jointctl run {path} --dry-run")
     return 0
+
+
+@contextmanager
+def _nothing_written() -> Iterator[None]:
+    """Ctrl-C within says so."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(f"{error}; nothing was written") from None
 
 
 def _new_arm(folder: Path, output: Output) -> int:
@@ -132,8 +142,9 @@ def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, a
     if ask:
         _require_terminal("what is open has a default")
         output.note("Enter takes the value in brackets")
-    answers = tuple(_answers(joint, i + 1, output, ask=ask) for i, joint in enumerate(joints))
-    files, remarks = first_arm(urdf, joints, answers, folder)
+    with _nothing_written():
+        answers = tuple(_answers(joint, i + 1, output, ask=ask) for i, joint in enumerate(joints))
+        files, remarks = first_arm(urdf, joints, answers, folder)
     _write_folder(folder, files, output)
     for remark in remarks:
         output.warning(remark)

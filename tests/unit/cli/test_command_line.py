@@ -361,6 +361,13 @@ def test_what_is_no_such_quantity_is_refused(jointctl: Jointctl, text: str) -> N
     assert "'--delay'" in done.err
 
 
+def test_a_decimal_comma_is_refused_with_the_point(jointctl: Jointctl) -> None:
+    done = jointctl("check", "virtual", "--delay", "1,5 ms")
+    assert done.code == 2
+    assert "(=1,5 ms)" in done.err
+    assert "; with a decimal point: 1.5 ms\n" in done.err
+
+
 # --- Options that stand in a dataclass reach the verb as one object; the command line shows them one by one ---
 @dataclass(frozen=True)
 class Place:

@@ -243,6 +243,17 @@ def test_an_answer_that_may_not_be_is_refused_by_name(place: tuple[str, str], te
         checked(place, text)
 
 
+@pytest.mark.parametrize(("text", "point"), [("0,5", "0.5"), ("-,5", "-0.5"), ("1,25 kg cm2", "1.25 kg cm2")])
+def test_a_decimal_comma_is_answered_with_the_point(text: str, point: str) -> None:
+    with pytest.raises(ValueError, match=rf"should be a valid number; with a decimal point: {point}$"):
+        checked(("joint", "inertia_kgm2"), text)
+
+
+def test_its_twin_is_a_list() -> None:
+    with pytest.raises(ValueError, match=r"should be a valid number$"):
+        checked(("joint", "inertia_kgm2"), "1,2,3")
+
+
 @pytest.mark.parametrize("maxon", [True, False])
 def test_what_an_epos4_counts_in_and_lacks_is_said(tmp_path: Path, joint: DeviceOnBus, maxon: bool) -> None:
     assert joint.device is not None

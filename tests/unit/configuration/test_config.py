@@ -214,6 +214,9 @@ def test_files_that_are_no_configuration_give_one_line(tmp_path: Path) -> None:
     path.write_text("[bus]\nchannel = \n")
     with pytest.raises(ConfigurationError, match=r"not valid TOML: .*line 2, column 11\): channel =$"):
         load_config(path)
+    path.write_text("[joint]\ninertia_kgm2 = 0,5  # by CAD\n")
+    with pytest.raises(ConfigurationError, match=r"inertia_kgm2 = 0,5 # by CAD; with a decimal point: 0\.5$"):
+        load_config(path)
     path.write_text("bus = 3\n")
     with pytest.raises(ConfigurationError, match=r"bus \(=3\) must be a section: \[bus\]"):
         load_config(path)

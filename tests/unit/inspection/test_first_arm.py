@@ -151,6 +151,15 @@ def test_what_check_remarks_is_said_at_once(tmp_path: Path) -> None:
     assert "mimics j1: for the model it stands at 0" in " ".join(said.getvalue().split())
 
 
+@pytest.mark.parametrize(("effort", "told"), [(3, True), (5, False)])
+def test_a_joint_that_gravity_is_too_much_for_is_named(tmp_path: Path, effort: int, told: bool) -> None:
+    (tmp_path / "own.urdf").write_text(robot(joint(1, LIMIT.format(effort=effort)), (4.0,)))  # 3.92 Nm, stretched
+    out, _, said = output()
+    assert new(tmp_path / "arm", out, arm=True, urdf=tmp_path / "own.urdf", no_input=True) == 0
+    words = "joint j1: gravity reaches 3.92 Nm within the joints' limits, and limits.torque_max_Nm (=3) of j1.toml"
+    assert (words in " ".join(said.getvalue().split())) is told
+
+
 @pytest.mark.parametrize(
     ("text", "joints", "said"),
     [
@@ -216,6 +225,18 @@ def test_questions_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     said = err.getvalue()
     assert re.search(r"drive.node \(=-3\)", said)
     assert "drive.node (=many)" in said
+
+
+def test_ctrl_c_at_a_question_says_that_nothing_was_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> str:
+        raise KeyboardInterrupt
+
+    urdf = answered(tmp_path, monkeypatch, "")
+    monkeypatch.setattr(sys.stdin, "readline", interrupted)
+    out, _, _ = output()
+    with pytest.raises(KeyboardInterrupt, match=r"^; nothing was written$"):
+        new(tmp_path / "arm", out, arm=True, urdf=urdf)
+    assert not (tmp_path / "arm").exists()
 
 
 def test_two_joints_with_one_node_are_refused_with_the_names_of_the_files(
