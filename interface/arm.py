@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, one_line
 from jointctl.joint import state_of
 from jointctl.joint_source import Wanted
 from jointctl.program import Newest, Program, motor_of
@@ -138,9 +138,13 @@ class Arm(Program):
         return self._simulated("records").records.reshape(-1, len(self.names))
 
     def _numbers(self, name: str, given: npt.ArrayLike) -> tuple[float, ...]:
-        values = np.atleast_1d(np.asarray(given, object))
+        try:
+            values = np.atleast_1d(np.asarray(given, object))
+        except ValueError:  # of arrays that make none together
+            values = np.zeros((0, 0))
         if values.shape != (len(self.names),):
-            raise ConfigurationError(f"{name} {values.shape} must be ({len(self.names)},): {', '.join(self.names)}")
+            shown = one_line(str(given))[:40]
+            raise ConfigurationError(f"{name} (={shown}) must be {len(self.names)} numbers: {', '.join(self.names)}")
         return tuple(finite(f"{name} of {joint}", value) for joint, value in zip(self.names, values, strict=True))
 
     def _state(self, newest: Newest) -> ArmState:

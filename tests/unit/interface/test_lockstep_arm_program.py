@@ -166,7 +166,16 @@ def test_nor_does_a_motion(arm: jointctl.Arm) -> None:
     [
         ([0.1, 9.0, 0.1], {}, "elbow: .*position"),
         ([0.1, 0.1, 1.0], {"duration_s": 0.01}, "wrist: "),
-        ([0.1, 0.1], {}, r"position_rad \(2,\) must be \(3,\): shoulder, elbow, wrist"),
+        ([0.1, 0.1], {}, r"^position_rad \(=\[0\.1, 0\.1\]\) must be 3 numbers: shoulder, elbow, wrist$"),
+        (None, {}, r"^position_rad \(=None\) must be 3 numbers"),
+        ("0.1", {}, r"^position_rad \(=0\.1\) must be 3 numbers"),
+        (np.zeros((3, 1)), {}, r"^position_rad \(=\[\[0\.\] \[0\.\] \[0\.\]\]\) must be 3 numbers"),
+        (
+            [np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2))],
+            {},
+            r"^position_rad \(=\[array\(.*\) must be 3 numbers",
+        ),
+        ([[0.1, 0.2], [0.3], [0.4]], {}, r"^position_rad of shoulder \(=\[0\.1, 0\.2\]\) must be a number$"),
         ([0.1, math.inf, 0.1], {}, r"position_rad of elbow \(=inf\) must be finite"),
         ([0.1, 0.1, 0.1], {"duration_s": math.nan}, "duration_s"),
     ],
