@@ -218,7 +218,6 @@ def raise_if(lines: list[str]) -> None:
 
 
 _BY_KIND = ("trajectory", "motion")  # sections whose key `kind` decides which class they have
-_TRAJECTORIES = "'sine', 'min_jerk', 'trapezoid', 'table', 'hold'"  # whose key `kind` decides what else is in it
 
 
 def _model_at(
@@ -309,11 +308,17 @@ def problem_line(
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         return f"{name} (={_shown(value)}) must be a section: [{name}]"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        tags = error["ctx"].get("expected_tags", _TRAJECTORIES)
+        tags = error["ctx"].get("expected_tags") or _kinds(model, location[-1])
         given = f" (={_shown(value.get('kind'))})" if kind == "union_tag_invalid" else ""
-        return f"{name}.kind{given} must be one of {tags.removeprefix('one of ')}"
+        return f"{name}.kind{given} must be one of {tags}"
     given = "is empty:" if value is None else f"(={_shown(value)})"  # as a page's field; no file can say so
     return f"{name} {given} {_RULES.get(kind) or _rule(error)}"
+
+
+def _kinds(model: type[BaseModel] | None, section: str) -> str:
+    """What `kind` may be in that section."""
+    sections = get_args(model.model_fields[section].annotation) if model is not None else ()
+    return ", ".join(repr(*get_args(one.model_fields["kind"].annotation)) for one in sections)
 
 
 _RULES = {

@@ -159,6 +159,9 @@ class _Reader:
     def read(self, robot: ElementTree.Element) -> Urdf:
         if next((one for one in robot.iter() if "xacro" in one.tag), None) is not None:
             raise ConfigurationError(f"{self._path}: has elements of xacro, which must be expanded first")
+        for one in (one for tag in ("link", "joint") for each in robot.findall(tag) for one in each.iter()):
+            if odd := next((text for text in one.attrib.values() if "${" in text or "$(" in text), None):
+                raise ConfigurationError(f"{self._path}: {one.tag} has {odd}: xacro, which must be expanded first")
         for tag in ("link", "joint"):
             if (count := len(robot.findall(tag))) > MOST_LINKS:
                 raise ConfigurationError(f"{self._path}: {count} elements {tag}, at most {MOST_LINKS} are read")
@@ -353,6 +356,8 @@ class _Reader:
                 self._problem(f"joint {joint.name} is in a loop that the base {roots[0]} has no part in")
             if joint.mimics is not None and joint.mimics not in joints:
                 self._problem(f"joint {joint.name}: <mimic> (={joint.mimics}) must name a joint")
+            elif joint.mimics == joint.name:
+                self._problem(f"joint {joint.name}: <mimic> (={joint.mimics}) must name another joint")
         reach_m = max(LEAST_REACH_m, sum(float(np.linalg.norm(joint.origin.offset_m)) for joint in order))
         masses = {name: self._mass(name, element, reach_m) for name, element in links.items()}
         return roots[0], masses, tuple(order)

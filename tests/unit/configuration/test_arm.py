@@ -203,6 +203,9 @@ IN_URDF: list[tuple[str, str, str]] = [
         "wrist must be a joint of arm.urdf that moves",
     ),
     (r'<limit lower="-2.0"', '<mimic joint="thumb"/><limit lower="-2.0"', "joint wrist: <mimic> (=thumb) must name a"),
+    (r'<limit lower="-2.0"', '<mimic joint="wrist"/><limit lower="-2.0"', "(=wrist) must name another joint"),
+    (r'"hand"', '"${prefix}hand"', "arm.urdf: child has ${prefix}hand: xacro, which must be expanded first"),
+    (r'lower="-2.0"', 'lower="$(arg low)"', "arm.urdf: limit has $(arg low): xacro, which must be expanded first"),
     (
         r"</robot>",
         '<xacro:macro name="x"/></robot>',
@@ -293,6 +296,10 @@ IN_FILES: list[tuple[str, str, str, str]] = [
     ("arm.toml", r'"shoulder", "elbow", ', '"elbow", "shoulder", ', "joint shoulder is nearer to the base than elbow"),
     ("arm.toml", r"amplitude_rad = \[0.6, ", "amplitude_rad = [", "motion.amplitude_rad (=2 numbers) must have 3"),
     ("arm.toml", r"amplitude_rad = \[0.6", "amplitude_rad = [1.2", "with [motion], shoulder.toml: trajectory"),
+    *(
+        ("arm.toml", r'kind = "sine"', kind, f"motion.kind{given} must be one of 'sine', 'min_jerk', 'table', 'hold'")
+        for kind, given in (('kind = "trapezoid"', " (=trapezoid)"), ("", ""))
+    ),
     ("arm.toml", r"payload_kg", "payload", "arm.payload is not a known key: did you mean payload_kg"),
     ("arm.toml", r'feed_forward = "whole"', 'feed_forward = "all"', "arm.feed_forward (=all) must be"),
     ("arm.toml", r"motor_inertia_kgm2 = \[.*?\]", "", "arm.motor_inertia_kgm2 must be given"),
