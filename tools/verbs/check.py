@@ -146,7 +146,7 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
     """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
     from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
     from jointctl.tools.analysis.margin_gate import require_loop
-    from jointctl.tools.session.plan import blamed
+    from jointctl.tools.session.plan import blamed, resolve_arm
 
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
     table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
@@ -182,6 +182,7 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
     for loop in loops:
         with blamed(f"joint {loop.name}"):
             require_loop(loop.config, loop.settings, loop.margins, allow_low_margin=allow_low_margin)
+    resolve_arm(arm)  # the motion, which a run refuses as well
     return 0
 
 

@@ -35,8 +35,10 @@ from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMoti
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import blamed, free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
+from jointctl.tools.verbs.check import check_arm
 from jointctl.tools.verbs.verb_options import arm_on_bus
 from tests.configurations import changed
+from tests.sessions import output
 
 NAMES = ["shoulder", "elbow", "wrist"]
 
@@ -100,21 +102,23 @@ def test_a_motion_that_takes_more_than_a_joints_torque_is_refused_before_anythin
     motion = f"duration_s = {duration_s}\namplitude_rad = [0.04, 0.04, 0.04]\nfrequency_Hz = [{frequency_Hz}, 0.1, 0.1]"
     arm = moving(tmp_path, f'[motion]\nkind = "sine"\n{motion}\n')
     resolve_arm(arm, free)  # that is not what it does there
-    if allowed:
-        resolve_arm(arm)
-    else:
-        with pytest.raises(ConfigurationError, match=r"^shoulder: the motion takes .* must be in \[-145\.\.145\]"):
-            resolve_arm(arm)
+    for refuses in (resolve_arm, lambda arm: check_arm(arm, output()[0])):
+        if allowed:
+            refuses(arm)
+        else:
+            with pytest.raises(ConfigurationError, match=r"^shoulder: the motion takes .* must be in \[-145\.\.145\]"):
+                refuses(arm)
 
 
 def test_what_is_wrong_with_a_table_is_the_arms_motion_and_not_the_joints(tmp_path: Path) -> None:
     table = "time_s,shoulder_rad,elbow_rad,wrist_rad\n0,0,0,0\n0.1,0,1,0\n2,0,0,0\n"
     arm = moving(tmp_path, '[motion]\nkind = "table"\nduration_s = 1.0\nfile = "way.csv"\n', table)
-    with pytest.raises(ConfigurationError) as caught:
-        resolve_arm(arm)
-    lines = caught.value.message.splitlines()
-    assert len(lines) == 2
-    assert all(re.match(r".*arm\.toml: with \[motion\], .*elbow\.toml: trajectory: ", line) for line in lines)
+    for refuses in (resolve_arm, lambda arm: check_arm(arm, output()[0])):
+        with pytest.raises(ConfigurationError) as caught:
+            refuses(arm)
+        lines = caught.value.message.splitlines()
+        assert len(lines) == 2
+        assert all(re.match(r".*arm\.toml: with \[motion\], .*elbow\.toml: trajectory: ", line) for line in lines)
 
 
 def test_an_approach_that_swings_beyond_a_limit_is_refused_before_anything_moves(arm: ArmConfig) -> None:
