@@ -156,6 +156,24 @@ def test_a_filter_that_reads_a_count_as_motion_raises_what_counts_as_standing(tm
     assert limits.standstill_radps == pytest.approx(0.1 * config.limits.velocity_max_radps)
 
 
+@pytest.mark.parametrize(("frequency_Hz", "kind"), [(0.1, "sine"), (1.0, "min_jerk")])
+@pytest.mark.parametrize("title", ["verification", "the same before"])
+def test_it_is_verified_from_wherever_the_joint_stands(
+    tmp_path: Path, frequency_Hz: float, kind: str, title: str
+) -> None:
+    """The sine begins with speed, 80 mrad from a limit: from the other one its approach would swing beyond it."""
+    output, *_ = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    for start_rad in (-0.69, 0.69):
+        config = changed(
+            load_config(shipped_config("precise")), trajectory__offset_rad=-0.62, trajectory__amplitude_rad=0.05,
+            trajectory__frequency_Hz=frequency_Hz, sequence__approach_s=0.0, virtual__initial_position_rad=start_rad,
+        )  # fmt: skip
+        job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)
+        assert f"verify     {kind} " in "\n".join(job.envelope())
+        assert job._verified(config, title)["peak_mrad"] < 5.0
+
+
 @pytest.mark.parametrize("plan", ["same", "another"])
 def test_a_friction_step_that_was_cut_off_goes_on_where_it_ended(tmp_path: Path, plan: str) -> None:
     config = load_config(written(tmp_path / "joint.toml", "precise"))

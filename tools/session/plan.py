@@ -335,26 +335,13 @@ class ConfiguredMotion:
     def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint will go, how fast, with how much torque, for how long.
 
-        `MotionFault` where the approach, which may swing back for the speed that the trajectory begins with, would
-        leave the limits.  The longer the farther: in an arm it takes as long as that of the slowest joint.
+        `MotionFault` as of `require_approach`.
         """
-        config, limits = self.config, self.config.limits
+        config = self.config
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
         first = approach_start(axis.trajectory, self.table)
         approach = float(axis.sequence.approach_s)
-        if approach:
-            way = approach_peak(report.start_position_rad, first, approach)
-            low_rad, high_rad = limits.position_min_rad - ROUNDING_rad, limits.position_max_rad + ROUNDING_rad
-            stands_inside = low_rad <= report.start_position_rad <= high_rad  # else the loop says so
-            for far_rad in (way.position_min_rad, way.position_max_rad):
-                if stands_inside and not low_rad <= far_rad <= high_rad:
-                    raise MotionFault(
-                        f"the approach from {report.start_position_rad:+.4f} rad in {approach:.1f} s swings to "
-                        f"{far_rad:+.4f} rad, must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], "
-                        "the limits.position_*_rad",
-                        "begin nearer to the beginning of the motion (of an arm with all joints), with a shorter "
-                        "sequence.approach_s where that is a number, or with a motion that begins at rest",
-                    )
+        require_approach(config.limits, axis, self.table, report.start_position_rad)
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
         return [
@@ -367,6 +354,27 @@ class ConfiguredMotion:
             limits_line(config.limits),
             *remark_lines(report.remarks),
         ]
+
+
+def require_approach(limits: Limits, axis: AxisConstants, table: np.ndarray, start_rad: float) -> None:
+    """`MotionFault` where the approach, which may swing back for the speed of the beginning, would leave the limits.
+
+    The longer the farther: in an arm it takes as long as that of the slowest joint.
+    """
+    approach = float(axis.sequence.approach_s)
+    low_rad, high_rad = limits.position_min_rad - ROUNDING_rad, limits.position_max_rad + ROUNDING_rad
+    if not approach or not low_rad <= start_rad <= high_rad:  # who stands outside is named by the loop
+        return
+    way = approach_peak(start_rad, approach_start(axis.trajectory, table), approach)
+    for far_rad in (way.position_min_rad, way.position_max_rad):
+        if not low_rad <= far_rad <= high_rad:
+            raise MotionFault(
+                f"the approach from {start_rad:+.4f} rad in {approach:.1f} s swings to "
+                f"{far_rad:+.4f} rad, must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], "
+                "the limits.position_*_rad",
+                "begin nearer to the beginning of the motion (of an arm with all joints), with a shorter "
+                "sequence.approach_s where that is a number, or with a motion that begins at rest",
+            )
 
 
 # --- The one conversation before something is done to a joint or its drive: what is shown, and who says yes ---

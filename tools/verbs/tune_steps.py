@@ -18,7 +18,10 @@ import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
+from jointctl.firmware_py.motion_records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
@@ -35,15 +38,15 @@ from jointctl.tools.configuration.found_values import (
     without_friction,
 )
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.records import trajectory_table
-from jointctl.tools.configuration.sections import Limits, ReducerMap
+from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.configuration.sections import Limits, MinJerk, ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
-from jointctl.tools.session.plan import ConfiguredMotion
+from jointctl.tools.session.plan import ConfiguredMotion, require_approach
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
@@ -91,6 +94,7 @@ class Tune:
     carrier: Carrier
     folder: Path
     config: Config = field(init=False)
+    verifying: Trajectory = field(init=False)
     state: dict[str, Any] = field(init=False, default_factory=dict)  # results by step, as JSON holds them
     fit: JointFit | None = field(init=False, default=None)
     response: FrequencyResponse | None = field(init=False, default=None)
@@ -115,6 +119,7 @@ class Tune:
                 }
             )
         response_task(self.config, None, AS_IT_FITS.legs)  # what does not fit is refused before anything moves
+        self.verifying = verifying_motion(self.config)
 
     # --- what it will do ---
 
@@ -125,14 +130,18 @@ class Tune:
         task = response_task(self.config, None, AS_IT_FITS.legs)
         top_radps = SWEEP_SHARE * limits.velocity_max_radps
         inside = f"{low:+.3f} .. {high:+.3f} rad"
-        trajectory = self.config.trajectory.kind
+        verified = f"{self.verifying.kind} of the configuration"
+        if self.verifying.kind != self.config.trajectory.kind:
+            verified = (
+                f"{self.verifying.kind} over the range of the configured motion, whose approach may swing too far"
+            )
         return [
             f"tune       {output}, law {self.options.law}, objective {self.options.objective}",
             "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
             f"response   triangle at 0.2 rad/s within {inside}, multisine up to {task.largest_Nm:.1f} Nm, 2 minutes",
             f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
             "map        once back and forth at 0.03 rad/s, where the reducer is soft",
-            f"verify     {trajectory} of the configuration, {VERIFY_s:.0f} s, with the new and the old gains; before "
+            f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
             "and after it half a minute of the response, for a joint that has changed",
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
             "keep the joint free and unloaded, a hand on the emergency stop",
@@ -453,9 +462,8 @@ class Tune:
         return found.model_copy(update={"reducer": self.original.reducer, "joint_encoder": self.original.joint_encoder})
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
-        trajectory = config.trajectory
-        seconds = min(trajectory.duration_s or VERIFY_s, VERIFY_s)
-        moving = config.model_copy(update={"trajectory": trajectory.model_copy(update={"duration_s": seconds})})
+        seconds = self.verifying.duration_s
+        moving = with_motion(config, self.verifying)
         motion = ConfiguredMotion(moving, trajectory_table(moving))
         also = title != "verification"
         carried = self.carrier.run(moving, motion, title, also_faults=also)
@@ -560,6 +568,38 @@ class Tune:
         self._save()
         write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
+
+
+def with_motion(config: Config, motion: Trajectory) -> Config:
+    """With an approach from wherever the step before has left the joint."""
+    sequence = config.sequence.model_copy(update={"approach_s": "auto"})
+    return config.model_copy(update={"trajectory": motion, "sequence": sequence})
+
+
+def verifying_motion(config: Config) -> Trajectory:
+    """That of the configuration, `VERIFY_s` at most.
+
+    Where its approach would leave the limits from one of their ends: back and forth over its range, as fast, at rest at
+    both ends, which the approach from wherever the joint stands does not pass.
+    """
+    limits, table = config.limits, trajectory_table(config)
+    seconds = min(config.trajectory.duration_s or VERIFY_s, VERIFY_s)
+    motion = config.trajectory.model_copy(update={"duration_s": seconds})
+    moving = with_motion(config, motion)
+    try:
+        for start_rad in (limits.position_min_rad, limits.position_max_rad):
+            (axis,) = axis_constants(moving, table, start_position_rad=start_rad)
+            require_approach(limits, axis, table, start_rad)
+    except (ConfigurationError, MotionFault):
+        constants = new(TrajectoryConstants)
+        fill_trajectory(constants[0], config, table)
+        low, high, speed, acceleration = peak_of(constants[0], table)
+        way = high - low
+        move_s = max(QUINTIC_PEAK_SPEED * way / speed, math.sqrt(QUINTIC_PEAK_ACCELERATION * way / acceleration))
+        return MinJerk(
+            kind="min_jerk", duration_s=seconds, start_rad=low, target_rad=high, move_s=move_s, repeat=True
+        )  # fmt: skip
+    return motion
 
 
 def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
