@@ -16,6 +16,7 @@ from jointctl.tools.inspection.objects import (
     device_type_text,
     error_register_text,
     no_error_or,
+    polarity_text,
     status_bits,
     supported_modes,
     transmission_text,
@@ -99,10 +100,11 @@ def rated_torque_mNm(reader: SdoReader) -> float | None:
 
 
 def ratings(reader: SdoReader) -> dict[str, Any]:
-    """Rated current and torque, the torque constant that follows from them, encoder and gear."""
+    """Rated current and torque, the torque constant that follows from them, encoder, gear, what 6064 counts in."""
     current_mA, torque_mNm = reader.value(0x6075), rated_torque_mNm(reader)
     increments, turns = reader.value(0x608F, 1), reader.value(0x608F, 2)
     motor, shaft = reader.value(0x6091, 1), reader.value(0x6091, 2)
+    feed, turns_of_feed, polarity = reader.value(0x6092, 1), reader.value(0x6092, 2), reader.value(0x607E)
     return {
         "rated_current_A": None if current_mA is None else current_mA * MILLI,
         "rated_torque_Nm": None if torque_mNm is None else torque_mNm * MILLI,
@@ -110,6 +112,8 @@ def ratings(reader: SdoReader) -> dict[str, Any]:
         "encoder_increments": increments,
         "encoder_motor_revolutions": turns,
         "gear_ratio": motor / shaft if motor and shaft else None,
+        "feed_constant": f"{feed} units of 6064 for {turns_of_feed} turns of the shaft" if feed else None,
+        "polarity": None if polarity is None else polarity_text(polarity),
     }
 
 

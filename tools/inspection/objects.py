@@ -100,6 +100,12 @@ def error_register_text(value: int) -> str:
     return f"{value & 0xFF:02X}h {', '.join(names) or 'none'}"
 
 
+def polarity_text(value: int) -> str:
+    """Of 607E: `C0h inverts positions, velocities`; `00h inverts nothing`."""
+    names = [name for bit, name in ((7, "positions"), (6, "velocities")) if value >> bit & 1]
+    return f"{value & 0xFF:02X}h inverts {', '.join(names) or 'nothing'}"
+
+
 def no_error_or(code: int, text: Callable[[int], str]) -> str:
     """`0000h, no error`, or what `text` says."""
     return text(code) if code else "0000h, no error"

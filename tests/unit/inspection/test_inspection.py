@@ -17,7 +17,7 @@ from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.inspection import subject as node_scan
-from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
+from jointctl.tools.inspection.drive_info import drive_info, pdo_maps, ratings
 from jointctl.tools.inspection.objects import Objects, standard_variable
 from jointctl.tools.inspection.subject import (
     Ear,
@@ -27,6 +27,7 @@ from jointctl.tools.inspection.subject import (
     subject_of_config,
     subject_of_flags,
 )
+from jointctl.tools.verbs.info import info_table
 from jointctl.tools.verbs.info import node_info as info
 from jointctl.tools.verbs.monitor import MonitorOptions, Selection, selection_of
 from jointctl.tools.verbs.monitor import monitor_bus as monitor
@@ -146,6 +147,19 @@ class TestInfo:
         assert (tpdo["cob_id"], tpdo["enabled"], tpdo["transmission"]) == ("281h", False, "every SYNC")
         assert tpdo["objects"][1] == "6064 Position actual value (32 bit)"
         assert only_reads(joint)
+
+    def test_what_positions_count_in_and_the_polarity(self) -> None:
+        class Drive:
+            @staticmethod
+            def value(index: int, sub: int = 0) -> int | None:
+                return {(0x6092, 1): 720_000, (0x6092, 2): 2, (0x607E, 0): 0xC0}.get((index, sub))
+
+        reader: Any = Drive()
+        found = ratings(reader)
+        assert found["feed_constant"] == "720000 units of 6064 for 2 turns of the shaft"
+        told, out, _ = output()
+        told.result(info_table({"ratings": found}))
+        assert re.search(r"polarity +C0h inverts positions, velocities", out.getvalue())
 
     def test_without_an_eds_the_standard_names_do(self, joint: Any) -> None:
         told, out, _ = output()
