@@ -7,6 +7,7 @@ simulated time as well.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,13 +16,18 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault, UsageError
+from jointctl.firmware_py.motion_records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.found_values import Found, rounded, with_values
+from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.configuration.sections import MinJerk, Trajectory
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
@@ -29,7 +35,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import Display, run_display
 from jointctl.tools.session.fault_words import FaultText, fault_text
-from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent
+from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
 from jointctl.tools.tuning.frequency_response import (
@@ -136,6 +142,44 @@ class ShownConsent(TerminalConsent):
     def show(self, lines: Sequence[str]) -> None:
         for line in lines:
             self._output.note(f"  {line}") if self._given else self._output.fact(line)
+
+
+# --- The motion that shows what was found ---
+
+
+VERIFY_s = 30.0
+
+
+def with_motion(config: Config, motion: Trajectory) -> Config:
+    """With an approach from wherever the step before has left the joint."""
+    sequence = config.sequence.model_copy(update={"approach_s": "auto"})
+    return config.model_copy(update={"trajectory": motion, "sequence": sequence})
+
+
+def verifying_motion(config: Config) -> Trajectory:
+    """That of the configuration, `VERIFY_s` at most.
+
+    Where its approach would leave the limits from one of their ends: back and forth over its range, as fast, at rest at
+    both ends, which the approach from wherever the joint stands does not pass.
+    """
+    limits, table = config.limits, trajectory_table(config)
+    seconds = min(config.trajectory.duration_s or VERIFY_s, VERIFY_s)
+    motion = config.trajectory.model_copy(update={"duration_s": seconds})
+    moving = with_motion(config, motion)
+    try:
+        for start_rad in (limits.position_min_rad, limits.position_max_rad):
+            (axis,) = axis_constants(moving, table, start_position_rad=start_rad)
+            require_approach(limits, axis, table, start_rad)
+    except (ConfigurationError, MotionFault):
+        constants = new(TrajectoryConstants)
+        fill_trajectory(constants[0], config, table)
+        low, high, speed, acceleration = peak_of(constants[0], table)
+        way = high - low
+        move_s = max(QUINTIC_PEAK_SPEED * way / speed, math.sqrt(QUINTIC_PEAK_ACCELERATION * way / acceleration))
+        return MinJerk(
+            kind="min_jerk", duration_s=seconds, start_rad=low, target_rad=high, move_s=move_s, repeat=True
+        )  # fmt: skip
+    return motion
 
 
 # --- The frequency response: short stages that begin small and grow, then the whole one ---

@@ -18,10 +18,7 @@ import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
-from jointctl.firmware_py.motion_records import TrajectoryConstants
-from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
@@ -38,25 +35,28 @@ from jointctl.tools.configuration.found_values import (
     without_friction,
 )
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
-from jointctl.tools.configuration.sections import Limits, MinJerk, ReducerMap, Trajectory
+from jointctl.tools.configuration.records import trajectory_table
+from jointctl.tools.configuration.sections import Limits, ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
-from jointctl.tools.session.plan import ConfiguredMotion, require_approach
+from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import (
     Carrier,
     NotCarriedOut,
+    VERIFY_s,
     measured_response,
     require_one_joint,
     require_same_joint,
     response_task,
+    verifying_motion,
+    with_motion,
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
 from jointctl.tools.tuning.gains import TWO_ENCODERS, ChosenGains, choose_gains, has_both_encoders
@@ -79,7 +79,7 @@ SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
 SWEEP_OBSERVER_radps = 50.0
 SWARM = SwarmSettings(particles=300, iterations=1500)
 STANDS, STANDSTILL_SHARE = 1.2, 0.1  # times what a count reads, and at most that of limits.velocity_max_radps
-VERIFY_s, VERIFY_FROM_s = 30.0, 5.0
+VERIFY_FROM_s = 5.0
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
 REFINE_APART = 0.15  # share by which gains that are tried must differ
@@ -568,38 +568,6 @@ class Tune:
         self._save()
         write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
-
-
-def with_motion(config: Config, motion: Trajectory) -> Config:
-    """With an approach from wherever the step before has left the joint."""
-    sequence = config.sequence.model_copy(update={"approach_s": "auto"})
-    return config.model_copy(update={"trajectory": motion, "sequence": sequence})
-
-
-def verifying_motion(config: Config) -> Trajectory:
-    """That of the configuration, `VERIFY_s` at most.
-
-    Where its approach would leave the limits from one of their ends: back and forth over its range, as fast, at rest at
-    both ends, which the approach from wherever the joint stands does not pass.
-    """
-    limits, table = config.limits, trajectory_table(config)
-    seconds = min(config.trajectory.duration_s or VERIFY_s, VERIFY_s)
-    motion = config.trajectory.model_copy(update={"duration_s": seconds})
-    moving = with_motion(config, motion)
-    try:
-        for start_rad in (limits.position_min_rad, limits.position_max_rad):
-            (axis,) = axis_constants(moving, table, start_position_rad=start_rad)
-            require_approach(limits, axis, table, start_rad)
-    except (ConfigurationError, MotionFault):
-        constants = new(TrajectoryConstants)
-        fill_trajectory(constants[0], config, table)
-        low, high, speed, acceleration = peak_of(constants[0], table)
-        way = high - low
-        move_s = max(QUINTIC_PEAK_SPEED * way / speed, math.sqrt(QUINTIC_PEAK_ACCELERATION * way / acceleration))
-        return MinJerk(
-            kind="min_jerk", duration_s=seconds, start_rad=low, target_rad=high, move_s=move_s, repeat=True
-        )  # fmt: skip
-    return motion
 
 
 def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
