@@ -229,11 +229,13 @@ def _never_slept_ns(words: np.ndarray, timespec: np.ndarray) -> int:
 
 
 @kernel
-def _put_set_points(stream: StreamConstants, world: World, scenario: Scenario, put: int, now_ns: int) -> int:
+def _put_set_points(
+    stream: StreamConstants, world: World, points: np.ndarray, start_ns: int, put: int, now_ns: int
+) -> int:
     """What the program does by `now_ns`, with its faults; how many of its set-points it has come to by then."""
-    faults, memory, points = world.faults, world.fault_memory[0], scenario.set_points
+    faults, memory = world.faults, world.fault_memory[0]
     silent = kind_active(faults, memory, FaultKind.PROGRAM_SILENT, now_ns)
-    while put < len(points) and scenario.start_ns + round(points[put, POINT_TIME_s] * 1e9) <= now_ns:
+    while put < len(points) and start_ns + round(points[put, POINT_TIME_s] * 1e9) <= now_ns:
         if not silent:
             slot = stream.written[0] % SET_POINTS
             stream.time_ns[slot] = now_ns
@@ -276,24 +278,32 @@ def _clear(world: World) -> None:
 
 
 @kernel
-def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, truth: np.ndarray) -> tuple[int, int]:
+def part_of_a_run(
+    memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, part: np.ndarray, truth: np.ndarray
+) -> tuple[int, int]:
+    """`run_lockstep`, or one of the many short parts that a run is made of (`kernel.bound`).
+
+    `part` int64[2]: when it begins and its cycles, instead of the scenario's, to be set before.  One kernel for both:
+    compiling it takes longer than most simulations.
+    """
     words, clock_memory, period_ns = memory.words, memory.timespec, scenario.period_ns
+    start_ns, cycles = part[0], part[1]
     faults, fault = world.faults, world.fault_memory[0]
     faulty = len(faults) > 0
     link = _Link(codec, world, scenario, memory)
     exchange = Exchange(_receive, _send, link)
     clock = Clock(_clock_ns, _never_slept_ns)
     if fault.epoch_ns < 0:
-        fault.epoch_ns = scenario.start_ns
+        fault.epoch_ns = start_ns
     if scenario.supervisor_beats:
-        store_release(words, Word.SUPERVISOR_NS, scenario.start_ns - period_ns)
+        store_release(words, Word.SUPERVISOR_NS, start_ns - period_ns)
     _clear(world)
     first, rows, missed, elapsed, put = load_acquire(words, Word.HEAD), 0, 0, 1, 0
-    finished_at = scenario.cycles
-    for cycle in range(scenario.cycles + scenario.tail_cycles):
+    finished_at = cycles
+    for cycle in range(cycles + scenario.tail_cycles):
         if cycle >= finished_at + scenario.tail_cycles:
             break
-        now_ns = scenario.start_ns + cycle * period_ns
+        now_ns = start_ns + cycle * period_ns
         _step_world(world, now_ns)
         logged = scenario.log_every > 0 and cycle % scenario.log_every == 0
         if logged and rows < len(truth):
@@ -310,7 +320,7 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
             store_release(words, Word.SUPERVISOR_NS, now_ns)
         clock_memory[_NOW_NS] = now_ns
         if len(scenario.set_points) > 0:
-            put = _put_set_points(memory.constants[0].stream, world, scenario, put, now_ns)
+            put = _put_set_points(memory.constants[0].stream, world, scenario.set_points, start_ns, put, now_ns)
         if scenario.thermometer and now_ns % _READ_EVERY_NS < period_ns:
             for axis in range(len(world.device)):
                 reading = memory.constants[axis].law.temperature
@@ -343,22 +353,6 @@ def run_lockstep(
     records and of rows of `truth` written.
     """
     truth = np.zeros((0, TRUTHS)) if truth is None else truth
-    written, rows = _run(memory, codec, world, scenario, truth)
+    part = np.array((scenario.start_ns, scenario.cycles), np.int64)
+    written, rows = part_of_a_run(memory, codec, world, scenario, part, truth)
     return int(written), int(rows)
-
-
-@kernel
-def part_of_a_run(
-    memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, part: np.ndarray, no_truth: np.ndarray
-) -> tuple[int, int]:
-    """One of the many short parts that a run is made of (`kernel.bound`), without true values.
-
-    `part` int64[2]: when it begins and its cycles, to be set before; `no_truth` float64[0, TRUTHS].
-    """
-    s = scenario
-    now = Scenario(
-        part[0], s.period_ns, part[1], s.stop_cycle, s.stop_request, s.tail_cycles, s.log_every, s.ideal_velocity,
-        s.supervisor_beats, s.lost_to_drive, s.lost_from_drive, s.set_points,
-        s.thermometer,
-    )  # fmt: skip
-    return _run(memory, codec, world, now, no_truth)
