@@ -19,6 +19,11 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests import plain_records
+
+if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+    plain_records.use()
+
 from jointctl.drivers import stop_note
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.hil.canopen import dictionary, encoder_node
@@ -26,7 +31,6 @@ from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.virtual_joint import new_device
-from tests import plain_records
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS, ROOT
@@ -58,8 +62,6 @@ def pytest_configure() -> None:
     for name in ("COLUMNS", "LINES"):  # readline gives them to processes that a test process starts
         os.environ.pop(name, None)
     gc.set_threshold(50_000, 20, 10)  # a tenth of the time of tests went into it
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        plain_records.use()
     os.nice = lambda _: 0  # what one test tries would slow down all that follow in its process
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 

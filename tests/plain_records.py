@@ -1,54 +1,47 @@
 """Fields of records where kernels run as plain Python: as numpy gives them, in a fraction of the time.
 
 `np.record` looks for a name among everything else before its fields, and makes a record of a part of a record by a view
-whose safety it proves anew: most of the time of the tests that run the kernels without the compiler.
+whose safety it proves anew; members of an enum are looked for by Python code before 3.12.  Each is a function that
+coverage sees called: most of the time of the tests that run the kernels without the compiler.
 """
 
 from __future__ import annotations
 
+import enum
 from typing import Any
 
 import numpy as np
 
-_NO_FIELDS = frozenset(dir(np.void))
-_numpys_attribute, _numpys_store = np.record.__getattribute__, np.record.__setattr__
-_of_void, _field, _store, _part = np.void.__getattribute__, np.void.__getitem__, np.void.__setitem__, np.void.getfield
-# id of a type -> its parts that are records, with type and place; and the type, so that it stays that one's id
-_parts: dict[int, tuple[dict[str, tuple[Any, int]], Any]] = {}
+from jointctl.firmware_py import schema
+
+numpys_attribute = np.record.__getattribute__
 
 
-def _parts_of(dtype: Any) -> tuple[dict[str, tuple[Any, int]], Any]:
-    places = [(name, *place[:2]) for name, place in dtype.fields.items()]
-    parts = {name: (np.dtype((np.record, part)), at) for name, part, at in places if part.names is not None}
-    return _parts.setdefault(id(dtype), (parts, dtype))
+class _OfRecords(dict[type, np.dtype[Any]]):
+    """The layout of each class, whose parts are records as they are read."""
+
+    def __setitem__(self, cls: type, dtype: np.dtype[Any]) -> None:
+        super().__setitem__(cls, np.dtype((np.record, dtype)))
 
 
-def attribute(record: np.record, name: str) -> Any:
-    """`record.name`"""
-    if name in _NO_FIELDS:
-        return _of_void(record, name)
-    dtype = _of_void(record, "dtype")
-    part = (_parts.get(id(dtype)) or _parts_of(dtype))[0].get(name)
-    if part is not None:
-        return _part(record, *part)
-    try:
-        return _field(record, name)
-    except (KeyError, ValueError):
-        return _numpys_attribute(record, name)
-
-
-def set_attribute(record: np.record, name: str, value: Any) -> None:
-    """`record.name = value`"""
-    if name in _NO_FIELDS:
-        _numpys_store(record, name, value)
-        return
-    try:
-        _store(record, name, value)
-    except (KeyError, ValueError):
-        _numpys_store(record, name, value)
+def _member(cls: Any, name: str) -> Any:
+    """Of an enum; from then on an attribute like any other."""
+    if name.startswith("_"):  # numpy asks each member for __array_ufunc__
+        raise AttributeError(name)
+    member = cls._member_map_.get(name)
+    if member is None:
+        raise AttributeError(name)
+    type.__setattr__(cls, name, member)
+    return member
 
 
 def use() -> None:
-    """For all records of this process."""
-    np.record.__getattribute__ = attribute  # type: ignore[assignment]
-    np.record.__setattr__ = set_attribute  # type: ignore[assignment]
+    """For all records of this process, before any is declared; a name that is no field is a `KeyError` then."""
+    assert not schema._DTYPES
+    schema._DTYPES = _OfRecords()
+    record: Any = np.record
+    record.__getattribute__, record.__getattr__ = np.void.__getattribute__, np.void.__getitem__
+    record.__setattr__ = np.void.__setitem__
+    of_enums: Any = enum.EnumType
+    if "__getattr__" in vars(of_enums):
+        of_enums.__getattr__ = _member

@@ -435,7 +435,7 @@ PLAIN = (
     "firmware_py/axis/test_safety*", "firmware_py/axis/test_axis_swing*", "firmware_py/axis/test_sequence_*",
     "firmware_py/test_friction", "firmware_py/test_kalman", "firmware_py/test_law", "drivers/canopen/test_cia402",
     "firmware_py/axis/test_live_*", "firmware_py/axis/test_stream", "firmware_py/axis/test_supervision_edges",
-    "firmware_py/axis/test_sweep_velocity_command", "firmware_py/axis/test_own_loop",
+    "firmware_py/axis/test_sweep_velocity_command", "firmware_py/axis/test_own_loop", "firmware_py/test_schema",
 )  # fmt: skip
 FULLY_COVERED = (
     "drivers/canopen/cia.py",
