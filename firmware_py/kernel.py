@@ -27,7 +27,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -44,6 +44,7 @@ _KERNEL_SOURCES = (
     *(f"tools/{pattern}" for pattern in TOOLS_WITH_KERNELS),
 )
 _KEPT_CACHES = 4
+LONGEST_WAIT_s, _LOOK_s = 120.0, 0.05  # for another process that compiles the same, and how often is looked
 
 
 def source_hash(root: Path | None = None) -> str:
@@ -123,6 +124,32 @@ def _options() -> str:
     return machine_code.options()
 
 
+@contextlib.contextmanager
+def _one_process(lock: Path) -> Iterator[None]:
+    """Others wait for who compiles already, but not for ever: it may have been halted."""
+    file = None
+    try:
+        from fcntl import LOCK_EX, LOCK_NB, LOCK_UN, flock  # not every system has it
+
+        file = os.open(lock, os.O_CREAT | os.O_WRONLY, 0o600)
+        for _ in range(round(LONGEST_WAIT_s / _LOOK_s)):
+            try:
+                flock(file, LOCK_EX | LOCK_NB)
+                break
+            except BlockingIOError:
+                time.sleep(_LOOK_s)
+    except (ImportError, OSError):  # compiling twice does no harm
+        pass
+    try:
+        yield
+    finally:
+        if file is not None:
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
+                flock(file, LOCK_UN)  # also for a child that was forked meanwhile
+            os.close(file)
+
+
 class Kernel:
     """A function that is compiled when Python calls it, unless the cache has its machine code.
 
@@ -176,13 +203,21 @@ class Kernel:
                     code = machine_code.read(path)
                 if code is None:
                     with compiling():
-                        code = _compiler().compiled(self, arguments)
-                    if path is not None:
-                        with contextlib.suppress(OSError):  # a disk that takes no more costs the next start some time
-                            machine_code.write(path, code)
+                        code = self._compiled(arguments, path)
                 address = machine_code.link(code, lambda: _compiler().load_helpers())
                 self._entries[form] = machine_code.Entry(self.__qualname__, code, address)
             return self._entries[form]
+
+    def _compiled(self, arguments: tuple[Any, ...], path: Path | None) -> machine_code.MachineCode:
+        if path is None:
+            return cast(machine_code.MachineCode, _compiler().compiled(self, arguments))
+        with _one_process(path.with_suffix(".lock")):
+            code = machine_code.read(path)  # of who was first
+            if code is None:
+                code = _compiler().compiled(self, arguments)
+                with contextlib.suppress(OSError):  # a disk that takes no more costs the next start some time
+                    machine_code.write(path, code)
+            return code
 
     def _cache_path(self, arguments: tuple[Any, ...]) -> Path | None:
         if cache_folder is None or self.py_func.__closure__:

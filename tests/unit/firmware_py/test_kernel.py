@@ -407,6 +407,46 @@ def test_the_cache_is_where_the_variable_says(tmp_path: Path) -> None:
     assert folder.is_dir()
 
 
+TWO_AT_ONCE = """
+import sys, time
+from pathlib import Path
+from jointctl.firmware_py import compiler
+from jointctl.firmware_py.safety import within
+compiled, count = compiler.compiled, []
+def slowly(*given):
+    count.append(1)
+    time.sleep(1.0)
+    return compiled(*given)
+compiler.compiled = slowly
+folder, own = Path(sys.argv[1]), int(sys.argv[2])
+(folder / f"here{own}").touch()
+while not (folder / f"here{1 - own}").exists():
+    time.sleep(0.001)
+assert within(1.0, 0.0, 2.0)
+print(len(count))
+"""
+
+
+def test_what_two_processes_need_at_once_is_compiled_once(tmp_path: Path) -> None:
+    environment = {**os.environ, "JOINTCTL_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen([sys.executable, "-c", TWO_AT_ONCE, tmp_path, str(k)], env=environment, stdout=subprocess.PIPE)
+        for k in range(2)
+    ]
+    assert sorted(one.communicate(timeout=100.0)[0].split() for one in both) == [[b"0"], [b"1"]]
+    assert list(tmp_path.glob("numba-*/*.lock")) == []
+
+
+def test_a_process_that_is_halted_while_it_compiles_is_not_waited_for_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_module, "LONGEST_WAIT_s", 0.1)
+    entered = []
+    with kernel_module._one_process(tmp_path / "lock"), kernel_module._one_process(tmp_path / "lock"):
+        entered.append(True)
+    assert entered
+
+
 def test_without_a_folder_it_still_works(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
