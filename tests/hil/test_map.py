@@ -86,6 +86,15 @@ def test_a_motion_that_does_not_fit_is_one_clear_line(options: MapOptions, words
         config_of_map(shipped("realistic"), options)
 
 
+def test_with_a_small_ratio_four_motor_turns_are_travelled_where_the_limits_allow() -> None:
+    slow = {"joint__reduction_ratio": 30.0, "limits__position_min_rad": -0.8, "limits__position_max_rad": 0.8}
+    motion = config_of_map(shipped("realistic", **slow), MapOptions()).trajectory
+    assert motion.kind == "trapezoid"
+    assert motion.target_rad - motion.start_rad == pytest.approx(4.0 * math.tau / 30.0)
+    with pytest.raises(UsageError, match=r"--travel \(=0.7\) must be in \[0.8378..1.4\] rad"):
+        config_of_map(shipped("realistic", **slow), MapOptions(travel_rad=0.7))
+
+
 def test_the_motion_stays_within_the_limits_and_learns_nothing() -> None:
     config = config_of_map(shipped("realistic"), MapOptions())
     assert config.trajectory.kind == "trapezoid"

@@ -3,8 +3,9 @@
 Where the motor goes at constant speed, every whole motor turn gives one estimate: least squares of an offset, a slope
 and sines of 1 to HIGHEST periods a turn, of the difference of both encoders and of the torque.  The offset takes what
 hysteresis and friction do, the slope what changes slowly.  Where the joint swings instead of being held, its inertia
-and the slope of the friction against the speed have taken part of the torque: that is added.  The mean over the turns
-of both directions is the result, and their spread its interval of 95 %.
+and the slope of the friction against the speed have taken part of the torque, and the link's inertia has twisted the
+reducer: that is added.  The mean over the turns of both directions is the result.  Its interval of 95 % has their
+spread, and that what was added is known to STIFFNESS_ERROR and TORQUE_ERROR.
 
     eps(theta) = sum a_k sin(k n theta + phi_k)    by which the link is ahead of the motor, both as their encoders read
     r(theta)   = sum c_k sin(k n theta + phi_k)    torque that the motor gets besides, positive towards positive angle
@@ -36,6 +37,8 @@ HIGHEST = 12  # periods a motor turn that are looked for
 LEAST_TURNS = 4  # of the motor at constant speed, both directions together
 LEAST_ROWS = 8 * HIGHEST  # of a turn: fewer do not tell its sines apart
 LEVEL = 0.95
+STIFFNESS_ERROR = 0.3  # share by which it is known, hysteresis included: that of `margin.stiffness_error`
+TORQUE_ERROR = 0.15  # the same of inertia and of the slope of the friction
 _STEADY = 1e-3  # share of the speed by which a row of constant speed may be off
 _LARGEST_SPREAD = 3.0  # amplitudes below this many standard errors are no part of a map
 
@@ -52,6 +55,7 @@ class MapRun:
     motor_kgm2: float
     link_kgm2: float
     friction_Nmspr: tuple[float, float] = (0.0, 0.0)  # slope against speed at this speed, forwards and backwards
+    stiffness_Nmprad: float = math.inf  # of the reducer for a small motion
 
 
 @dataclass(frozen=True)
@@ -133,23 +137,28 @@ def _sines(angle_rad: np.ndarray, *values: np.ndarray) -> np.ndarray:
     return np.asarray(fitted[2 : 2 + HIGHEST] + 1j * fitted[2 + HIGHEST :])
 
 
-def _waves(estimates: np.ndarray) -> tuple[Wave, ...]:
-    """Mean and interval of complex amplitudes, shape (turns, HIGHEST)."""
+def _waves(parts: np.ndarray, error: float) -> tuple[Wave, ...]:
+    """Mean and interval of complex amplitudes, shape (turns, 2, HIGHEST): what was seen, and what a model added.
+
+    `error`: share by which that may be wrong.
+    """
     from scipy.stats import t  # here: only a map waits for it
 
-    count = len(estimates)
+    estimates, count = parts.sum(axis=1), len(parts)
+    doubt = error * np.abs(parts[:, 1].mean(axis=0))
     width = float(t.ppf(0.5 + 0.5 * LEVEL, count - 1)) / math.sqrt(count)
     waves = []
     for k, mean in enumerate(estimates.mean(axis=0)):
         amplitude = abs(mean)
         turned = estimates[:, k] * np.exp(-1j * np.angle(mean))
         along, across = np.std(turned.real, ddof=1), np.std(turned.imag, ddof=1)
-        half = width * float(across) / amplitude if amplitude > 0.0 else math.pi
-        error = math.hypot(along, across) / math.sqrt(count)
+        along_half, across_half = (math.hypot(width * float(spread), doubt[k]) for spread in (along, across))
+        half = across_half / amplitude if amplitude > 0.0 else math.pi
+        noise = math.hypot(along, across) / math.sqrt(count)
         waves.append(
             Wave(
-                k + 1, float(amplitude), width * float(along), float(np.angle(mean)), min(half, math.pi),
-                bool(amplitude > _LARGEST_SPREAD * error and _predicts(estimates[:, k])),
+                k + 1, float(amplitude), along_half, float(np.angle(mean)), min(half, math.pi),
+                bool(amplitude > max(_LARGEST_SPREAD * noise, along_half) and _predicts(estimates[:, k])),
             )
         )  # fmt: skip
     return tuple(waves)
@@ -174,21 +183,23 @@ def found_map(run: MapRun) -> FoundMap:
         )
     speed = float(np.max(np.abs(run.desired_radps)))
     orders_radps = np.arange(1, HIGHEST + 1) * run.ratio * speed
-    kinematic, ripple = [], []
+    kinematic, ripple = [], []  # what is seen, and what the swing adds
     for direction, rows in turns:
         motor = run.motor_rad[rows]
         link = motor if run.link_rad is None else run.link_rad[rows]
         # what the joint swings about its even motion: the angle itself is the abscissa, so that of time is taken
         even = np.polynomial.Polynomial.fit(np.arange(len(motor)), motor, 1)(np.arange(len(motor)))
         found = _sines(run.ratio * motor, link - motor, run.torque_Nm[rows], motor - even, link - even)
-        kinematic.append(found[:, 0])
         # tau + r = friction + J q''; of a wave over the angle, q' = +-i w and q'' = -w^2 times it
-        inertia_Nm = -(orders_radps**2) * (run.motor_kgm2 * found[:, 2] + run.link_kgm2 * found[:, 3])
+        link_Nm = -(orders_radps**2) * run.link_kgm2 * found[:, 3]
+        inertia_Nm = link_Nm - orders_radps**2 * run.motor_kgm2 * found[:, 2]
         slope = run.friction_Nmspr[0 if direction > 0 else 1]
         friction_Nm = slope * 1j * direction * orders_radps * found[:, 2]
-        ripple.append(friction_Nm + inertia_Nm - found[:, 1])
+        kinematic.append((found[:, 0], link_Nm / run.stiffness_Nmprad))
+        ripple.append((-found[:, 1], friction_Nm + inertia_Nm))
     return FoundMap(
-        () if run.link_rad is None else _waves(np.array(kinematic)), _waves(np.array(ripple)),
+        () if run.link_rad is None else _waves(np.array(kinematic), STIFFNESS_ERROR),
+        _waves(np.array(ripple), TORQUE_ERROR),
         (counts[0], counts[1]), speed,
     )  # fmt: skip
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
 
 SPEED_radps = 0.03
-LONGEST_rad = 0.7  # of the travel, unless more is asked for
+LONGEST_rad = 0.7  # of the travel, unless more is asked for, or that is less than LEAST_TURNS of the motor
+LEAST_TURNS = 4.0
 SPEED_SHARE = 0.5  # of limits.velocity_max_radps
 ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2
 _DWELL_S = 0.5
@@ -51,12 +52,13 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     limits = config.limits
     margin_rad = position_margin_rad(config)
     width_rad = limits.position_max_rad - limits.position_min_rad - 2.0 * margin_rad
-    travel_rad = min(width_rad, LONGEST_rad) if options.travel_rad is None else options.travel_rad
     turn_rad = math.tau / config.joint.reduction_ratio
-    if not 4.0 * turn_rad <= travel_rad <= width_rad:
+    longest_rad = max(LONGEST_rad, LEAST_TURNS * turn_rad)
+    travel_rad = min(width_rad, longest_rad) if options.travel_rad is None else options.travel_rad
+    if not LEAST_TURNS * turn_rad <= travel_rad <= width_rad:
         raise UsageError(
-            f"--travel (={travel_rad:.4g}) must be in [{4.0 * turn_rad:.4g}..{width_rad:.4g}] rad: four motor turns, "
-            "and what the limits allow"
+            f"--travel (={travel_rad:.4g}) must be in [{LEAST_TURNS * turn_rad:.4g}..{width_rad:.4g}] rad: "
+            f"{LEAST_TURNS:g} motor turns, and what the limits allow"
         )
     fastest = SPEED_SHARE * limits.velocity_max_radps
     if not 0.0 < options.speed_radps <= fastest:
@@ -91,6 +93,7 @@ def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:
         late_torque_Nm(rows.command_torque_Nm, 1.0 / config.loop.rate_Hz, late_s), rows.desired_velocity_radps.copy(),
         config.joint.reduction_ratio, motor_kgm2, config.joint.inertia_kgm2 - motor_kgm2,
         (_friction_slope(config, 1.0), _friction_slope(config, -1.0)),
+        math.inf if config.reducer is None else config.reducer.loop_stiffness_Nmprad or config.reducer.stiffness_Nmprad,
     )  # fmt: skip
 
 

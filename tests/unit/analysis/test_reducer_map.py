@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,6 +80,21 @@ def test_intervals_hold_about_as_often_as_they_say() -> None:
             wave = found.ripple_Nm[order - 1]
             inside.append(abs(wave.amplitude - size) <= wave.amplitude_half)
     assert 0.88 <= np.mean(inside) <= 1.0
+
+
+def test_what_the_links_inertia_twists_the_reducer_is_added_and_the_interval_holds_a_stiffness_that_is_wrong() -> None:
+    """A link whose swing on the reducer makes 14 % of the wave of four periods."""
+    omega_radps, soft = 4.0 * RATIO * SPEED, 1.8e3
+    truth, made = ERROR[4][0], made_run(swing=0.0)
+    assert made.link_rad is not None
+    twist = LINK * omega_radps**2 / soft
+    wave = series({4: ERROR[4]}, made.motor_rad)
+    run = replace(made, link_rad=made.link_rad + wave * (1.0 / (1.0 - twist) - 1.0))
+    assert found_map(run).kinematic_rad[3].amplitude > 1.1 * truth
+    assert found_map(replace(run, stiffness_Nmprad=soft)).kinematic_rad[3].amplitude == pytest.approx(truth, rel=0.01)
+    for wrong in (0.8, 1.0, 1.2):
+        found = found_map(replace(run, stiffness_Nmprad=wrong * soft)).kinematic_rad[3]
+        assert abs(found.amplitude - truth) <= found.amplitude_half
 
 
 def test_a_joint_with_one_encoder_has_a_map_of_ripple_alone() -> None:
