@@ -28,6 +28,7 @@ from jointctl.firmware_py.records import (
     SwingConstants,
     VelocityConstants,
 )
+from jointctl.firmware_py.safety import PUSHED_CYCLES
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import (
     CommandKind,
@@ -59,6 +60,7 @@ MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # feed-forward a healthy joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
 FROZEN_FRICTION = 1.5  # times the static friction: what a healthy joint does not stand still under
+FROZEN_WAYS = 2.0  # of the tolerance, that what is beyond the friction moves a rigid joint by in PUSHED_CYCLES
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
 MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
@@ -335,7 +337,13 @@ def _fill_limits(record: LimitConstants, config: Config) -> None:
     share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
     static_Nm = static_friction_Nm(config)
     if static_Nm is not None:
-        record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
+        # a heavy joint takes more to leave the tolerance in time
+        pushed_s = PUSHED_CYCLES / config.loop.rate_Hz
+        leaves_Nm = (
+            FROZEN_WAYS * 2.0 * config.joint.inertia_kgm2 * FROZEN_COUNTS * law_resolution_rad(config) / pushed_s**2
+        )
+        record.frozen_torque_Nm = static_Nm + max((FROZEN_FRICTION - 1.0) * static_Nm, leaves_Nm)
+        record.frozen_torque_Nm += abs(config.joint.gravity_Nm)
     second = config.joint_encoder
     if second is not None:
         record.disagreement_max_rad = second.disagreement_max_rad

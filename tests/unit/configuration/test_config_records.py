@@ -25,6 +25,7 @@ from jointctl.tools.configuration.checks import trajectory_extremes
 from jointctl.tools.configuration.conversions import (
     friction_constants,
     joint_rad_per_count,
+    static_friction_Nm,
     torque_constant_NmpA,
     velocity_of_a_count_radps,
 )
@@ -222,3 +223,16 @@ def test_the_velocity_of_one_count_is_what_the_filter_makes_of_it(
     for position_rad in (0.0, abs(joint_rad_per_count(config))):
         step_velocity(constants_of(config)[0].velocity, state, position_rad, 0.0, 1)
     assert velocity_of_a_count_radps(config) == pytest.approx(state.velocity_radps)
+
+
+def test_a_reading_that_stands_is_pushed_by_what_moves_a_heavy_joint_out_of_its_tolerance(tmp_path: Path) -> None:
+    """20 cycles at that torque, less friction: more than four counts, however heavy the joint is."""
+    for inertia, counts in ((2.1, 524288), (60.0, 65536)):
+        text = VIRTUAL.replace("inertia_kgm2 = 2.1", f"inertia_kgm2 = {inertia}")
+        config = load(tmp_path, "counts_per_turn = .*", f"counts_per_turn = {counts}", text)
+        limits = constants_of(config)[0].limits
+        static_Nm = static_friction_Nm(config)
+        assert static_Nm is not None
+        way_rad = 0.5 * (limits.frozen_torque_Nm - static_Nm) / inertia * (20.0 / config.loop.rate_Hz) ** 2
+        assert way_rad > 1.9 * limits.frozen_tolerance_rad
+        assert limits.frozen_torque_Nm >= 1.5 * static_Nm
