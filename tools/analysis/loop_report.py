@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
-from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.conversions import (
+    static_friction_Nm,
+    torque_constant_NmpA,
+    velocity_of_a_count_radps,
+)
+from jointctl.tools.configuration.records import FROZEN_SHARE
 from jointctl.tools.configuration.sections import Trajectory
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
@@ -84,11 +90,16 @@ def not_modelled(config: Config) -> list[str]:
 DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
 MOST_RATED, LEAST_RATED = 10.0, 0.02  # of the motor's rated current, that the torque limit asks for
 MOST_A, LEAST_A = 300.0, 0.02  # where no rated current is configured
+FRICTION_ERROR = 0.1  # share by which friction is often wrong
+BEGINS_S = 0.1  # in which a motion begins
 
 
 def contradictions(config: Config) -> list[str]:
     """One line for each; every one names the keys, and what follows from them."""
-    return [*rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config)]
+    return [
+        *rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config),
+        *_standstill_contradiction(config), *_friction_contradiction(config), *_stiffness_contradiction(config),
+    ]  # fmt: skip
 
 
 def rated_contradiction(config: Config) -> list[str]:
@@ -154,6 +165,44 @@ def _inertia_contradictions(config: Config) -> list[str]:
             "is it that of the motor, without the ratio squared?"
         )
     return found
+
+
+def _standstill_contradiction(config: Config) -> list[str]:
+    """A reading that flickers by one count."""
+    of_a_count, standstill = velocity_of_a_count_radps(config), config.limits.standstill_radps
+    if of_a_count <= standstill:
+        return []
+    return [
+        f"limits.standstill_radps (={standstill:g}) is less than {of_a_count:.3g}, what one count of the encoder reads "
+        f"behind control.velocity_cutoff_Hz (={config.control.velocity_cutoff_Hz:g}): a joint whose reading "
+        "flickers is never taken to stand (STOP_TIMEOUT)"
+    ]
+
+
+def _friction_contradiction(config: Config) -> list[str]:
+    """Friction that is a little more than believed, against what the law pushes with where the joint stays behind."""
+    control, static_Nm = config.control, static_friction_Nm(config)
+    if static_Nm is None or control.feed_forward == "none" or config.drive.own_loop() is not CommandKind.TORQUE:
+        return []
+    wrong_Nm, behind_rad = FRICTION_ERROR * static_Nm, FROZEN_SHARE * config.limits.following_error_max_rad
+    pushes_Nm = config.joint.inertia_kgm2 * control.kp * behind_rad * (1.0 + control.observer_radps * BEGINS_S)
+    if pushes_Nm >= wrong_Nm:
+        return []
+    return [
+        f"control.kp (={control.kp:g}) and observer_radps (={control.observer_radps:g}) push a joint that is "
+        f"{behind_rad:g} rad behind with {pushes_Nm:.3g} Nm: friction that is {FRICTION_ERROR:.0%} more than "
+        f"[friction] ({wrong_Nm:.3g} Nm) holds it there (POSITION_FROZEN)"
+    ]
+
+
+def _stiffness_contradiction(config: Config) -> list[str]:
+    reducer = config.reducer
+    if reducer is None or (reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad) >= reducer.stiffness_Nmprad:
+        return []
+    return [
+        f"reducer.loop_stiffness_Nmprad (={reducer.loop_stiffness_Nmprad:g}) is less than reducer.stiffness_Nmprad "
+        f"(={reducer.stiffness_Nmprad:g}): hysteresis makes a small motion stiffer, not softer"
+    ]
 
 
 # --- Bode plot with its margins, sensitivity, closed-loop poles ---

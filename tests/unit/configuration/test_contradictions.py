@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from jointctl.tools.analysis.loop_report import contradictions, trajectory_acceleration
+from jointctl.tools.configuration.conversions import static_friction_Nm, velocity_of_a_count_radps
 from tests.configurations import changed, shipped
 
 VIRTUAL = shipped()
@@ -18,7 +19,7 @@ def lines(**changes: Any) -> str:
     return "\n".join(contradictions(changed(VIRTUAL, **changes)))
 
 
-@pytest.mark.parametrize("name", ["virtual", "precise", "paper", "sweep_virtual", "elmo_serial"])
+@pytest.mark.parametrize("name", ["virtual", "precise", "paper", "sweep_virtual", "elmo_serial", "realistic", "csp"])
 def test_what_is_shipped_contradicts_nothing(name: str) -> None:
     assert contradictions(shipped(name)) == []
 
@@ -66,6 +67,29 @@ def test_an_inertia_that_is_the_motors(share: float, warned: bool) -> None:
     limits = VIRTUAL.limits
     light = share * limits.torque_max_Nm / VIRTUAL.loop.rate_Hz / limits.velocity_max_radps
     assert ("without the ratio squared?" in lines(joint__inertia_kgm2=light)) is warned
+
+
+@pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])
+def test_one_count_of_the_encoder_is_slower_than_standstill(share: float, warned: bool) -> None:
+    standstill = share * velocity_of_a_count_radps(VIRTUAL)
+    assert ("limits.standstill_radps" in lines(limits__standstill_radps=standstill)) is warned
+
+
+@pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])
+def test_a_soft_loop_is_held_by_friction_that_is_a_little_more(share: float, warned: bool) -> None:
+    soft = shipped("realistic")
+    static_Nm = static_friction_Nm(soft)
+    assert static_Nm is not None
+    kp = share * 0.1 * static_Nm / (soft.joint.inertia_kgm2 * 0.01 * (1.0 + 0.1))
+    own = changed(soft, control__kp=kp, control__observer_radps=1.0)
+    assert any("(POSITION_FROZEN)" in line for line in contradictions(own)) is warned
+    assert contradictions(changed(own, control__feed_forward="none")) == []
+
+
+@pytest.mark.parametrize(("stiffness", "warned"), [(None, False), (1.7e4, False), (1.69e4, True)])
+def test_a_small_motion_is_no_softer(stiffness: float | None, warned: bool) -> None:
+    found = contradictions(changed(shipped("realistic"), reducer__loop_stiffness_Nmprad=stiffness))
+    assert any("hysteresis makes a small motion stiffer" in line for line in found) is warned
 
 
 def test_largest_accelerations() -> None:
