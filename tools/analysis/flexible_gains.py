@@ -31,6 +31,7 @@ LARGEST_S = 1.8
 LARGEST_S_ANYWHERE = 2.5
 LARGEST_NOISE_Nm = 0.6
 LARGEST_OBSERVER_radps = 110.0
+LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be told from an unstable one
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 SOFT_KV_1ps = 12.0
 WORTH_A_FILTER = 1.35  # by how much smaller the error must be: what repeats is learned badly behind one
@@ -104,7 +105,7 @@ class _Judged:
 def _with_gains(settings: LoopSettings, logarithms: Array) -> LoopSettings:
     """The loop with these logarithms of kv, of the observer's bandwidth and perhaps of the cut-off, to three digits."""
     kv, observer, *cutoff = (float(f"{math.exp(x):.3g}") for x in logarithms)
-    highest = HIGHEST_CUTOFF / settings.period_s
+    observer, highest = max(observer, LEAST_OBSERVER_radps), HIGHEST_CUTOFF / settings.period_s
     cutoff_Hz = min(cutoff[0], highest) if cutoff else settings.cutoff_Hz
     kp = float(f"{KP_OF_KV * kv * kv:.3g}")
     return replace(settings, kp=kp, kv=kv, observer_radps=observer, cutoff_Hz=cutoff_Hz)

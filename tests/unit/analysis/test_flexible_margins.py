@@ -267,6 +267,7 @@ def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> N
     gains = chosen_gains(config, loop_settings(config)[0])
     assert not gains.met
     assert gains.kv >= 1.0
+    assert gains.observer_radps >= 0.1  # the pole of a slower one is called unstable
     config = with_encoders(believed(), Encoders.MOTOR)
     assert chosen_gains(config, loop_settings(config)[0]).met
 
