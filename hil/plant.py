@@ -429,7 +429,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     resisting = load
     gravity = 0.0
     if c.gravity_Nm != 0.0:
-        gravity = c.gravity_Nm * math.sin(joint_middle)
+        gravity = c.gravity_Nm * math.sin(joint_middle - c.gravity_zero_rad)
         resisting += gravity
     if c.end_stops != 0:
         resisting += end_stop_torque_Nm(c, joint_middle, joint_velocity)
@@ -542,6 +542,7 @@ def _fill_mechanics(c: PlantConstants, settings: PlantSettings) -> None:
         "load_torque_Nm",
         "load_step_Nm",
         "gravity_Nm",
+        "gravity_zero_rad",
         "end_stops",
         "end_stop_min_rad",
         "end_stop_max_rad",

@@ -103,7 +103,8 @@ class PlantSettings:
     load_torque_Nm: float = number(0.0, -1e5, 1e5)
     load_step_Nm: float = number(0.0, -1e5, 1e5)
     load_step_at_s: float = number(80.0, 0.0, 1e9)
-    gravity_Nm: float = number(0.0, 0.0, 1e5)  # m g l of m g l sin(q)
+    gravity_Nm: float = number(0.0, 0.0, 1e5)  # m g l of m g l sin(q - gravity_zero_rad)
+    gravity_zero_rad: float = number(0.0, -1e3, 1e3)
     end_stops: bool = False
     end_stop_min_rad: float = number(-3.0, -1e4, 1e4)
     end_stop_max_rad: float = number(3.0, -1e4, 1e4)
@@ -295,6 +296,7 @@ class PlantConstants:
     load_step_Nm: f8
     load_step_substep: i8
     gravity_Nm: f8  # m g l
+    gravity_zero_rad: f8
     end_stops: i4
     end_stop_min_rad: f8
     end_stop_max_rad: f8

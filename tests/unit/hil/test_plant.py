@@ -88,6 +88,16 @@ def test_gravity_pendulum_keeps_its_energy_and_period():
     assert s[0].joint_position_rad == pytest.approx(0.01, rel=1e-4)
 
 
+def test_gravity_has_no_lever_at_its_zero():
+    for flexible in (False, True):
+        c, s = plant(gravity_Nm=10.0, gravity_zero_rad=0.4, initial_position_rad=0.4, flexible=flexible)
+        run(c[0], s[0], 0.0, 1000)
+        assert s[0].joint_position_rad == pytest.approx(0.4, abs=1e-12)
+        c, s = plant(gravity_Nm=10.0, gravity_zero_rad=0.4, initial_position_rad=0.4 + math.pi / 2.0, flexible=flexible)
+        run(c[0], s[0], 0.0, 1)
+        assert s[0].gravity_torque_Nm == pytest.approx(10.0)
+
+
 def test_gravity_sign_pulls_towards_zero():
     c, s = plant(gravity_Nm=10.0, initial_position_rad=math.pi / 2.0)
     run(c[0], s[0], 0.0, 1)
