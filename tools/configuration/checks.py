@@ -12,6 +12,7 @@ from jointctl.tools.configuration.sections import Encoder, Friction, FrictionDir
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 LARGEST_SHARE = 0.9  # of the friction that may go with the angle
+LARGEST_SLOPE = 0.5  # of the kinematic error against the angle: beyond 1 the link would turn against the motor
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -255,7 +256,7 @@ def _room_problems(config: Config, reducer: Reducer) -> list[str]:
     limits, torque_Nm = config.limits, config.limits.torque_max_Nm
     twist = sum(max(min(torque_Nm, ends[i + 1]) - ends[i], 0.0) / slope for i, slope in enumerate(slopes))
     if reducer.map is not None:
-        twist += sum(reducer.map.kinematic_error_rad)
+        twist += sum(map(abs, reducer.map.kinematic_error_rad))
     found = []
     if twist >= limits.following_error_max_rad:
         found.append(
@@ -296,7 +297,23 @@ def _map_problems(config: Config, made: ReducerMap) -> list[str]:
                 f"reducer.map.{name}_{unit} must be as long a list as its per_motor_turn and phase_rad, "
                 f"{' and '.join(map(str, counts))} are given"
             )
-    return found
+    waves = zip(made.kinematic_error_rad, made.kinematic_error_per_motor_turn, strict=False)
+    slope = config.joint.reduction_ratio * sum(abs(amplitude * order) for amplitude, order in waves)
+    if slope > LARGEST_SLOPE:
+        found.append(
+            f"reducer.map.kinematic_error_rad (={list(made.kinematic_error_rad)}) must be so small that the link never "
+            f"turns against the motor: times periods and joint.reduction_ratio it is {slope:.3g}, {LARGEST_SLOPE:g} is "
+            "allowed"
+        )
+    return found + _ripple_torque_problems("reducer.map.torque_ripple_Nm", made.torque_ripple_Nm, config)
+
+
+def _ripple_torque_problems(name: str, amplitudes_Nm: tuple[float, ...], config: Config) -> list[str]:
+    """It is fed forward: it must leave torque to move the joint with."""
+    torque_Nm, largest_Nm = sum(map(abs, amplitudes_Nm)), config.limits.torque_max_Nm
+    if torque_Nm < largest_Nm:
+        return []
+    return [f"{name} (={list(amplitudes_Nm)}) must be less than limits.torque_max_Nm (={largest_Nm:g}), added up"]
 
 
 def _ripple_problems(config: Config) -> list[str]:
@@ -314,6 +331,7 @@ def _ripple_problems(config: Config) -> list[str]:
     if len(set(counts)) > 1:
         given = ", ".join(map(str, counts))
         found.append(f"ripple.torque_Nm, per_motor_turn and phase_rad (={given}) must be equally many numbers")
+    found += _ripple_torque_problems("ripple.torque_Nm", made.torque_Nm, config)
     if _is_flexible(config):
         found.append('[ripple] is not for control.kind "flexible_joint": there it is torque_ripple of [reducer.map]')
     adaptation = config.control.adaptation

@@ -311,7 +311,8 @@ def problem_line(
         tags = error["ctx"].get("expected_tags") or _kinds(model, location[-1])
         given = f" (={_shown(value.get('kind'))})" if kind == "union_tag_invalid" else ""
         return f"{name}.kind{given} must be one of {tags}"
-    given = "is empty:" if value is None else f"(={_shown(value)})"  # as a page's field; no file can say so
+    shown = repr(value) if kind == "int_type" and isinstance(value, float) else _shown(value)  # 1e5 is no whole number
+    given = "is empty:" if value is None else f"(={shown})"  # as a page's field; no file can say so
     return f"{name} {given} {_RULES.get(kind) or _rule(error)}"
 
 
@@ -340,5 +341,6 @@ def _rule(error: ErrorDetails) -> str:
 
 def _shown(value: object) -> str:
     text = value if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
+    text = text.lower() if isinstance(value, bool) else text  # as TOML has it
     text = " ".join(text.split()) or '""'
     return text if len(text) <= 60 else text[:57] + "..."

@@ -146,8 +146,12 @@ def _validated(data: Mapping[str, Any], name: str) -> Config:
 
 
 _TURN = math.tau
+_ARCMIN = _TURN / 21600.0
 _FACTORS: Mapping[str, Mapping[str, float]] = {
-    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": _TURN / 360.0, "°": _TURN / 360.0, "turn": _TURN, "turns": _TURN},
+    "rad": {
+        "rad": 1.0, "mrad": 1e-3, "deg": _TURN / 360.0, "°": _TURN / 360.0, "turn": _TURN, "turns": _TURN,
+        "arcmin": _ARCMIN, "arcsec": _ARCMIN / 60.0,
+    },
     "radps": {
         "rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _TURN / 360.0, "°/s": _TURN / 360.0, "rpm": _TURN / 60.0,
         "r/min": _TURN / 60.0, "rev/min": _TURN / 60.0,
@@ -158,6 +162,8 @@ _FACTORS: Mapping[str, Mapping[str, float]] = {
     "Nm": {"Nm": 1.0, "mNm": 1e-3, "Ncm": 1e-2, "kNm": 1e3},
     "NmpA": {"Nm/A": 1.0, "mNm/A": 1e-3},
     "Nmps": {"Nm/s": 1.0},
+    "Nmprad": {"Nm/rad": 1.0, "kNm/rad": 1e3, "Nm/mrad": 1e3, "Nm/deg": 360.0 / _TURN, "Nm/arcmin": 1.0 / _ARCMIN},
+    "Nmspr": {"Nms/rad": 1.0, "Nm s/rad": 1.0},
     "A": {"A": 1.0, "mA": 1e-3},
     "kgm2": {"kgm2": 1.0, "kg m2": 1.0, "kg m^2": 1.0, "kg m²": 1.0, "kgcm2": 1e-4, "kg cm2": 1e-4, "gcm2": 1e-7},
     "bitps": {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6},

@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, NAME, RESERVED, split_channel, with_options
+from jointctl.firmware_py.records import HARMONICS, KNEES
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -250,17 +251,20 @@ class FrictionTemperature(Section):
     highest_degC: Annotated[float, between(-50.0, 200.0)] | None = None  # held above; none: reference + 40
 
 
-NUMBERS_TEXT = "a list of up to 4 numbers"
+def _list_of(most: int) -> Any:
+    """Validator of a list of TOML: a tuple afterwards, which a frozen model needs."""
+    allowed = f"a list of up to {most} numbers"
+
+    def check(value: object) -> tuple[float, ...]:
+        if isinstance(value, (list, tuple)) and len(value) <= most and all(is_number(x) for x in value):
+            return tuple(float(x) for x in value)
+        raise PydanticCustomError("numbers", "must be {allowed}", {"allowed": allowed})
+
+    return BeforeValidator(Rule(allowed, check))
 
 
-def _list(value: object) -> tuple[float, ...]:
-    """Lists of TOML as tuples, which a frozen model needs."""
-    if isinstance(value, (list, tuple)) and len(value) <= 4 and all(is_number(x) for x in value):
-        return tuple(float(x) for x in value)
-    raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
-
-
-Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
+Numbers = Annotated[tuple[float, ...], _list_of(HARMONICS)]
+PerKnee = Annotated[tuple[float, ...], _list_of(KNEES)]
 
 
 class FrictionAngle(Section):
@@ -412,8 +416,8 @@ class Reducer(Section):
 
     motor_inertia_kgm2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of joint.inertia_kgm2
     stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)]  # under a steady torque, up to the first knee
-    knees_Nm: Numbers = ()  # transmitted torques beyond which it is stiffer, two at most
-    stiffness_beyond_Nmprad: Numbers = ()  # beyond each knee
+    knees_Nm: PerKnee = ()  # transmitted torques beyond which it is stiffer
+    stiffness_beyond_Nmprad: PerKnee = ()  # beyond each knee
     # of a small motion, which hysteresis makes stiffer; none = stiffness_Nmprad
     loop_stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = None
     damping_Nmspr: Annotated[float, between(0.0, 1e6)] = 0.0  # of a small motion
@@ -555,8 +559,8 @@ class Virtual(Section):
     motor_side_inertia_kgm2: Annotated[float, between(1e-3, 1e4)] = 1.2  # at the joint; of joint.inertia_kgm2
     reducer_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 1.3e4  # with flexible = true
     reducer_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 5.0  # with flexible = true
-    reducer_knees_Nm: Numbers = ()  # transmitted torques beyond which the reducer is stiffer, two at most
-    reducer_stiffness_beyond_Nmprad: Numbers = ()  # beyond each knee
+    reducer_knees_Nm: PerKnee = ()  # transmitted torques beyond which the reducer is stiffer
+    reducer_stiffness_beyond_Nmprad: PerKnee = ()  # beyond each knee
     hysteresis_width_rad: Annotated[float, between(0.0, 0.1)] = 0.0  # of the reducer's loop, twist at no torque
     kinematic_error_rad: Numbers = ()  # amplitudes, at the joint, by which the reducer's output is ahead
     kinematic_error_per_motor_turn: Numbers = ()  # periods of each
@@ -565,7 +569,8 @@ class Virtual(Section):
     load_torque_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # constant, at the joint
     load_step_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # a load from load_step_at_s on
     load_step_at_s: Annotated[float, between(0.0, 1e9)] = 80.0  # of the plant's own time
-    gravity_Nm: Annotated[float, between(0.0, 1e5)] = 0.0  # m g l of m g l sin(q)
+    gravity_Nm: Annotated[float, between(0.0, 1e5)] = 0.0  # m g l of m g l sin(q - gravity_zero_rad)
+    gravity_zero_rad: Angle = 0.0  # joint angle at which gravity has no lever
     end_stops: bool = False  # springs at end_stop_min_rad and end_stop_max_rad
     end_stop_min_rad: Annotated[float, between(-1e4, 1e4)] = -3.0  # lower end stop
     end_stop_max_rad: Annotated[float, between(-1e4, 1e4)] = 3.0  # upper end stop

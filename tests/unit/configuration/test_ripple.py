@@ -45,6 +45,10 @@ def test_the_sines_reach_the_law_in_its_units(tmp_path: Path) -> None:
             {key: [1.0] * 5 for key in ("torque_Nm", "per_motor_turn", "phase_rad")},
             r"must be a list of up to 4 numbers",
         ),
+        (
+            {"torque_Nm": [500.0, -300.0]},
+            r"ripple.torque_Nm \(=\[500.0, -300.0\]\) must be less than limits.torque_max_Nm",
+        ),
         ({"base": "realistic"}, r'\[ripple\] is not for control.kind "flexible_joint"'),
     ],
 )

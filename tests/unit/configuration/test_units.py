@@ -28,6 +28,12 @@ from tests.configurations import VIRTUAL, load, problems
         ("bitrate_bitps", "0.5 Mbit/s", 500_000),
         ("max_torque_permille", "50 %", 500),
         ("torque_max_Nm", "1_500 mNm", 1.5),
+        ("stiffness_Nmprad", "17 kNm/rad", 1.7e4),
+        ("stiffness_Nmprad", "5 Nm/arcmin", 5.0 * 60.0 * 180.0 / math.pi),
+        ("stiffness_Nmprad", "300 Nm/deg", 300.0 * 180.0 / math.pi),
+        ("damping_Nmspr", "8 Nm s/rad", 8.0),
+        ("hysteresis_width_rad", "1 arcmin", math.pi / 180.0 / 60.0),
+        ("hysteresis_width_rad", "60 arcsec", math.pi / 180.0 / 60.0),
     ],
 )
 def test_what_has_one_meaning(key: str, text: str, value: float) -> None:

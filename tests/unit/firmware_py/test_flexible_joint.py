@@ -342,6 +342,10 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
         ({"reducer__map__direction": -1}, "reducer.map.direction (=-1) differs from encoder.direction (=1): the map"),
         ({"reducer__map__zero_counts": 7}, "reducer.map.zero_counts (=7) differs from encoder.zero_counts (=0): the"),
         ({"reducer__map__torque_ripple_Nm": [1.0]}, "reducer.map.torque_ripple_Nm must be as long a list as its"),
+        ({"reducer__map__kinematic_error_rad": [0.0019, 5e-4]}, "so small that the link never turns against the motor"),
+        ({"reducer__map__kinematic_error_rad": [-2.0, -4.0]}, "following_error_max_rad (=0.1) must be more than 6.002"),
+        ({"reducer__map__torque_ripple_Nm": [1030.0, -0.3]}, "torque_ripple_Nm (=[1030.0, -0.3]) must be less"),
+        ({"reducer__knees_Nm": [7.0, 25.0, 60.0]}, "reducer.knees_Nm (=[7.0, 25.0, 60.0]) must be a list of up to 2 n"),
         ({"encoder__side": "joint"}, "are the two encoders swapped?"),
         ({"control__feed_forward": "measured"}, "control.feed_forward (=measured) must be none, desired or lugre"),
         ({"control__filtered_error_rate": False}, "control.filtered_error_rate (=false) must be true for control.kind"),
@@ -360,6 +364,8 @@ def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], mes
 
 def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     changes = {"limits__following_error_max_rad": 0.003, "limits__position_max_rad": 0.3535}
+    load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    changes = {"reducer__map__kinematic_error_rad": [0.0015, 2e-4], "reducer__map__torque_ripple_Nm": [59.0, -0.9]}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
 
 
