@@ -16,7 +16,7 @@ import numpy as np
 
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.states import CommandKind, ControllerKind, Encoders
-from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings, loop_settings
+from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings, TwoMasses, loop_settings
 from jointctl.tools.analysis.margins import (
     OBSERVING,
     Convergence,
@@ -285,14 +285,18 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
 
 # --- Margins of the loops that a drive closes itself (CSP, CSV), where the configuration gives its gains ---
 #
-#     velocity loop   Lv = (Kv + Ki/s) / (J s) e^(-s Tv) / (1 + s Tl)   PI, Tv = 1.5 drive periods, Tl current lag
-#     position loop   Lp = Kp/s  Lv / (1 + Lv)  e^(-s Tp)               P; CSP: Tp = 0, the drive computes both at once
+#     velocity loop   Lv = (Kv + Ki/s) s P e^(-s Tv) / (1 + s Tl)       PI, Tv = 1.5 drive periods, Tl current lag
+#     position loop   Lp = Kp/s  Lv / (1 + Lv)  R e^(-s Tp)             P; CSP: Tp = 0, the drive computes both at once
 #                                                                       CSV: it is closed on the PC, Tp is our delay
 #
-# At the joint, rigid, without friction (which only adds damping) and without the offsets (which are outside the loops).
-# Not modelled: the drive's filters and its estimation of the velocity, a reducer that is not rigid.
+# P is the shaft that the drive's encoder sits on over torque, 1 / (J s^2) of a rigid joint.  With [reducer] it is that
+# of two masses, for each of the joints that the margins of a law are worked out for, and R is the shaft that feeds the
+# law over that of the drive's encoder (CSV; else 1): the worst joint counts.  Without the offsets, which are outside
+# the loops; a rigid joint also without friction, which only adds damping.
+# Not modelled: the drive's filters and its estimation of the velocity.
 
 _LOWEST_radps, _POINTS = 1e-2, 20_000
+_LEAST_DAMPING = 0.002  # of the critical one, of a reducer: a resonance without any falls between two points
 SAMPLES_LATE = 1.5  # of a sampled loop: one to compute, half for holding
 
 
@@ -304,23 +308,41 @@ class LoopMargin:
     phase_margin_deg: float
     crossover_Hz: float
     gain_margin_up: float  # inf: no gain makes it unstable
-
-    @property
-    def stable(self) -> bool:
-        return self.phase_margin_deg > 0.0 and self.gain_margin_up > 1.0
+    stable: bool
+    joint: str = ""  # the worst one, of several
 
 
-def _margin(name: str, omega: np.ndarray, response: np.ndarray) -> LoopMargin:
-    """The worst crossover, and the gain at the first crossing of -180 deg beyond the last one."""
-    size, phase_deg = np.abs(response), np.degrees(np.unwrap(np.angle(response)))
-    phase_deg -= 360.0 * np.round((phase_deg[0] + 135.0) / 360.0)  # it begins between -90 and -180 deg
-    crossings = np.flatnonzero((size[:-1] >= 1.0) & (size[1:] < 1.0))
+def _margin(name: str, omega: np.ndarray, response: np.ndarray, inner_stable: bool = True) -> LoopMargin:
+    """The crossover nearest to -180 deg, and the least gain that comes to -1; a resonance may have several of each.
+
+    Only an inner loop can be unstable in the open loop: where it is not, the loop is stable if -1 is not encircled.
+    """
+    size, away_deg = np.abs(response), np.degrees(np.angle(-response))  # from -180 deg
+    turned = np.unwrap(np.angle(1.0 + response))
+    stable = inner_stable and bool(abs(turned[-1]) < 0.5 * math.pi)
+    crossings = np.flatnonzero((size[:-1] >= 1.0) != (size[1:] >= 1.0))
     if not len(crossings):
-        return LoopMargin(name, math.nan, math.nan, math.nan)
-    worst = crossings[np.argmin(phase_deg[crossings])]
-    beyond = crossings[-1] + np.flatnonzero(phase_deg[crossings[-1] :] <= -180.0)
-    gain = 1.0 / float(size[beyond[0]]) if len(beyond) else math.inf
-    return LoopMargin(name, 180.0 + float(phase_deg[worst]), float(omega[worst]) / math.tau, gain)
+        return LoopMargin(name, math.inf if stable else -math.inf, math.nan, math.inf, stable)
+    worst = crossings[np.argmin(np.abs(away_deg[crossings]))]
+    through = np.flatnonzero((np.diff(np.sign(away_deg)) != 0.0) & (np.abs(away_deg[1:]) < 90.0) & (size[1:] < 1.0))
+    gain = 1.0 / float(np.max(size[through + 1])) if len(through) else math.inf
+    margin_deg = abs(float(away_deg[worst]))
+    return LoopMargin(name, margin_deg if stable else -margin_deg, float(omega[worst]) / math.tau, gain, stable)
+
+
+def _shafts(joint: TwoMasses, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of (motor, link) over the motor's torque [rad/Nm]."""
+    reduced = joint.motor_kgm2 * joint.link_kgm2 / (joint.motor_kgm2 + joint.link_kgm2)
+    critical = 2.0 * math.sqrt(joint.stiffness_Nmprad * reduced)
+    reducer = joint.stiffness_Nmprad + max(joint.damping_Nmspr, _LEAST_DAMPING * critical) * s
+    motor, link = (
+        inertia * s**2 + damping * s + held + reducer
+        for inertia, damping, held in zip(
+            (joint.motor_kgm2, joint.link_kgm2), joint.bristle_damping_Nmspr, joint.bristle_Nmprad, strict=True
+        )
+    )
+    together = motor * link - reducer**2
+    return link / together, reducer / together
 
 
 def _section(config: Config) -> CanopenSection:
@@ -337,25 +359,44 @@ def cascade_of(config: Config) -> Cascade:
 
 
 def cascade_margins(config: Config, delay_s: float) -> list[LoopMargin]:
-    """Of the loops whose gains are known, inner one first; `delay_s` is that of the loop on the PC."""
+    """Of the loops whose gains are known, inner one first, each with its worst joint.
+
+    `delay_s` is that of the loop on the PC.
+    """
+    soft = [joint for joint in loop_settings(config, delay_s)[0].joints if isinstance(joint, TwoMasses)]
+    joints: list[TwoMasses | None] = [*soft] or [None]
+    of_each = [_cascade_margins(config, delay_s, joint) for joint in joints]
+    return [min(loops, key=lambda loop: (loop.stable, loop.phase_margin_deg)) for loops in zip(*of_each, strict=True)]
+
+
+def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) -> list[LoopMargin]:
+    """Of one joint; None is a rigid one."""
     cascade, kind = cascade_of(config), config.drive.own_loop()
     omega = np.geomspace(_LOWEST_radps, math.pi * cascade.loop_rate_Hz, _POINTS)
     s = 1j * omega
+    if joint is None:
+        own = fed = 1.0 / (config.joint.inertia_kgm2 * s**2)
+    else:
+        shafts = dict(zip(("motor", "joint"), _shafts(joint, s), strict=True))
+        second = config.joint_encoder
+        own = fed = shafts[config.encoder.side]
+        if kind is CommandKind.VELOCITY and second is not None and second.law == "joint_encoder":
+            fed = shafts["joint"]
     drive_s = SAMPLES_LATE / cascade.loop_rate_Hz
     late_s = 0.0 if kind is CommandKind.POSITION else delay_s + 0.5 / config.loop.rate_Hz
     found, closed = [], np.ones_like(s)
     if cascade.velocity_gain_Nmspr is not None and cascade.velocity_integral_Nmprad is not None:
         gain = cascade.velocity_gain_Nmspr + cascade.velocity_integral_Nmprad / s
         lag = np.exp(-s * drive_s) / (1.0 + s * config.margin.current_lag_s)
-        velocity = gain / (config.joint.inertia_kgm2 * s) * lag
+        velocity = gain * s * own * lag
         found.append(_margin("velocity loop", omega, velocity))
         closed = velocity / (1.0 + velocity)
     elif kind is CommandKind.POSITION:
         return []  # nothing is known of what the position loop is closed around
     if cascade.position_gain_ps is not None:
-        position = cascade.position_gain_ps / s * closed * np.exp(-s * late_s)
-        found.append(_margin("position loop", omega, position))
-    return found
+        position = cascade.position_gain_ps / s * closed * (fed / own) * np.exp(-s * late_s)
+        found.append(_margin("position loop", omega, position, all(loop.stable for loop in found)))
+    return found if joint is None else [replace(loop, joint=joint.name) for loop in found]
 
 
 def cascade_unknowns(config: Config) -> list[str]:
@@ -365,7 +406,8 @@ def cascade_unknowns(config: Config) -> list[str]:
         found.append("the drive's velocity loop: drive.cascade.velocity_gain_Nmspr and velocity_integral_Nmprad")
     if cascade.position_gain_ps is None:
         found.append("the drive's position loop: drive.cascade.position_gain_ps")
-    return [*found, "the drive's filters, its estimation of the velocity, and a reducer that is not rigid"]
+    rest = "the drive's filters, its estimation of the velocity"
+    return [*found, rest if config.reducer is not None else f"{rest}, and a reducer that is not rigid"]
 
 
 def require_cascade(config: Config, delay_s: float, *, allow_low_margin: bool = False) -> list[LoopMargin]:
@@ -377,7 +419,7 @@ def require_cascade(config: Config, delay_s: float, *, allow_low_margin: bool = 
             raise MarginError(
                 f"drive.mode (={_section(config).mode}): the phase margin of the {loop.name} "
                 f"(={loop.phase_margin_deg:.1f} deg{'' if loop.stable else ', unstable'}) must be at least "
-                f"{minimum_deg:g} deg",
+                f"{minimum_deg:g} deg{f'; worst case: {loop.joint}' if loop.joint else ''}",
                 "correct the gains in [drive.cascade], and those of the drive with its maker's software",
             )
     return found

@@ -71,11 +71,22 @@ def test_the_gain_margin_is_where_the_sampled_loop_becomes_unstable(loop: int, s
 def _simulated(config: Config, gains: list[Any], steps: int) -> float:
     """Growth of the error over the second half of a run from a small displacement."""
     period = 1.0 / drive_of(config).cascade.loop_rate_Hz  # type: ignore[union-attr]
-    lag, inertia = config.margin.current_lag_s, config.joint.inertia_kgm2
-    a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / inertia], [0.0, 0.0, -1.0 / lag]])
-    b = np.array([[0.0], [0.0], [1.0 / lag]])
-    ad, bd, *_ = signal.cont2discrete((a, b, np.eye(3), np.zeros((3, 1))), period)
-    x, integral, late = np.array([1e-3, 1e-3, 0.0]), 0.0, 0.0
+    lag, inertia, reducer = config.margin.current_lag_s, config.joint.inertia_kgm2, config.reducer
+    if reducer is None:
+        a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / inertia], [0.0, 0.0, -1.0 / lag]])
+    else:  # the shaft that the encoder sits on, and the other one
+        masses = [reducer.motor_inertia_kgm2, inertia - reducer.motor_inertia_kgm2]
+        own, other = masses if config.encoder.side == "motor" else masses[::-1]
+        k, d = reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad, reducer.damping_Nmspr
+        a = np.zeros((5, 5))
+        a[0, 1] = a[2, 3] = 1.0
+        a[1, :4], a[3, :4] = np.array([-k, -d, k, d]) / own, np.array([k, d, -k, -d]) / other
+        a[1 if config.encoder.side == "motor" else 3, 4], a[4, 4] = 1.0 / masses[0], -1.0 / lag
+    b = np.zeros((len(a), 1))
+    b[-1] = 1.0 / lag
+    ad, bd, *_ = signal.cont2discrete((a, b, np.eye(len(a)), np.zeros((len(a), 1))), period)
+    x, integral, late = np.zeros(len(a)), 0.0, 0.0
+    x[:2] = 1e-3
     sizes = []
     for _ in range(steps):
         error = gains[2] * -x[0] - x[1]
@@ -85,6 +96,40 @@ def _simulated(config: Config, gains: list[Any], steps: int) -> float:
         if sizes[-1] > 1e12:
             return math.inf
     return max(sizes[3 * steps // 4 :]) / max(sizes[steps // 4 : steps // 2])
+
+
+def soft_loop(side: str, mode: str = "csp", **cascade: float) -> Config:
+    """The joint that realistic.toml believes, and it alone, without friction; 0.5 ms lag."""
+    alone = {"margin__payload_range": (1.0, 1.0), "margin__stiffness_error": 0.0, "friction__lugre": None}
+    config = changed(shipped("realistic"), joint_encoder=None, encoder__side=side, **alone)
+    gains = {"velocity_gain_Nmspr": 150.0, "velocity_integral_Nmprad": 5000.0, "position_gain_ps": 20.0, **cascade}
+    return config.model_copy(update={"drive": own_loop(mode, **gains).drive})
+
+
+@pytest.mark.parametrize("share", [0.97, 1.03])
+@pytest.mark.parametrize(("side", "slower"), [("motor", 0.05), ("joint", 0.002)])
+def test_with_a_reducer_the_gain_margin_is_that_of_two_masses(side: str, slower: float, share: float) -> None:
+    config = soft_loop(
+        side, loop_rate_Hz=2000.0, position_gain_ps=1.0, velocity_gain_Nmspr=slower * 800.0,
+        velocity_integral_Nmprad=slower * 100.0,
+    )  # fmt: skip
+    velocity = cascade_margins(config, 1e-3)[0]
+    assert velocity.stable
+    factor = share * velocity.gain_margin_up
+    grows = _simulated(config, [factor * slower * 800.0, factor * slower * 100.0, 0.0], 8000) > 1.0
+    assert grows == (share > 1.0)
+
+
+def test_a_drive_that_closes_its_loops_over_a_soft_reducer_is_refused() -> None:
+    """Each was called stable with 60 deg, and ends by LIMIT_CYCLE in simulation."""
+    for mode in ("csp", "csv"):
+        assert require_cascade(soft_loop("motor", mode), 1e-3)
+        with pytest.raises(MarginError, match=r"velocity loop \(=-.* deg, unstable\) must be .*; worst case: without"):
+            require_cascade(soft_loop("joint", mode), 1e-3, allow_low_margin=True)
+    shipped_one = shipped("realistic")
+    stiff = own_loop("csv", velocity_gain_Nmspr=500.0, velocity_integral_Nmprad=40_000.0, position_gain_ps=50.0)
+    with pytest.raises(MarginError, match="position loop"):  # which reads the link
+        require_cascade(shipped_one.model_copy(update={"drive": stiff.drive}), 1e-3)
 
 
 def test_csv_closes_the_position_loop_here_and_feels_our_delay() -> None:
