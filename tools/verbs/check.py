@@ -127,9 +127,11 @@ def check_cascade(
     table.add_section()
     found = cascade_margins(config, delay.value)
     for loop in found:
-        note = f"at {loop.crossover_Hz:.1f} Hz; gain margin x {loop.gain_margin_up:.3g}"
-        note += f"; worst case: {loop.joint}" if loop.joint else ""
-        table.add_row(loop.name, f"{loop.phase_margin_deg:.1f} deg phase margin", note)
+        notes = [f"worst case: {loop.joint}"] if loop.joint else []
+        if loop.stable:
+            notes = [f"at {loop.crossover_Hz:.1f} Hz", f"gain margin x {loop.gain_margin_up:.3g}", *notes]
+        value = f"{loop.phase_margin_deg:.1f} deg phase margin" if loop.stable else "UNSTABLE"
+        table.add_row(loop.name, value, "; ".join(notes))
     for row in bench_of(config).check_rows(config):
         table.add_row(*row)
     data = {

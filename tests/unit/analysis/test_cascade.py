@@ -126,6 +126,10 @@ def test_a_drive_that_closes_its_loops_over_a_soft_reducer_is_refused() -> None:
         assert require_cascade(soft_loop("motor", mode), 1e-3)
         with pytest.raises(MarginError, match=r"velocity loop \(=-.* deg, unstable\) must be .*; worst case: without"):
             require_cascade(soft_loop("joint", mode), 1e-3, allow_low_margin=True)
+    out = io.StringIO()
+    with pytest.raises(MarginError):
+        check(soft_loop("joint"), Output(stdout=out, stderr=io.StringIO()))
+    assert "UNSTABLE" in out.getvalue()
     shipped_one = shipped("realistic")
     stiff = own_loop("csv", velocity_gain_Nmspr=500.0, velocity_integral_Nmprad=40_000.0, position_gain_ps=50.0)
     with pytest.raises(MarginError, match="position loop"):  # which reads the link
