@@ -45,7 +45,8 @@ SELF_LOCKING = 0.9  # Coulomb friction for each Nm that the reducer transmits
 
 
 def _allowed(name: str, value: object, allowed: str) -> ValueError:
-    return ValueError(f"{name} (={value}) must be {allowed}")
+    shown = list(value) if isinstance(value, tuple) else value  # as TOML has it
+    return ValueError(f"{name} (={shown}) must be {allowed}")
 
 
 def number(default: float, low: float, high: float) -> Any:
