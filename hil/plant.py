@@ -536,19 +536,10 @@ def _fill_mechanics(c: PlantConstants, settings: PlantSettings) -> None:
     c.inverse_driven_inertia = 1.0 / driven
     c.inverse_link_inertia = 1.0 / (settings.inertia_kgm2 - driven) if settings.flexible else 0.0
     for name in (
-        "flexible",
-        "reducer_stiffness_Nmprad",
-        "reducer_damping_Nmspr",
-        "load_torque_Nm",
-        "load_step_Nm",
-        "gravity_Nm",
-        "gravity_zero_rad",
-        "end_stops",
-        "end_stop_min_rad",
-        "end_stop_max_rad",
-        "end_stop_stiffness_Nmprad",
-        "end_stop_damping_Nmspr",
-    ):
+        "flexible", "reducer_stiffness_Nmprad", "reducer_damping_Nmspr", "load_torque_Nm", "load_step_Nm",
+        "gravity_Nm", "gravity_zero_rad", "end_stops", "end_stop_min_rad", "end_stop_max_rad",
+        "end_stop_stiffness_Nmprad", "end_stop_damping_Nmspr",
+    ):  # fmt: skip
         setattr(c, name, getattr(settings, name))
     c.load_step_substep = round(settings.load_step_at_s / settings.step_s)
 
