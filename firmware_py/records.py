@@ -423,6 +423,7 @@ class LimitConstants:
     frozen_max_rad: f8  # way of the reference while the reading stands still; 0 = not watched
     frozen_ahead_rad: f8  # of that way, so much at most does not count while the joint is ahead of its reference
     frozen_torque_Nm: f8  # that a healthy joint would not stand still under; 0 = not watched
+    frozen_cycles: i8  # of that torque, at least PUSHED_CYCLES
     frozen_bias_Nm: f8  # what it takes to hold it where it stands; that torque pushes no joint
     frozen_tolerance_rad: f8  # a reading that changes by no more stands still
     sample_age_max_cycles: i8

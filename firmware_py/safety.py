@@ -373,7 +373,8 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
             trip(state, Fault.POSITION_FROZEN, way_rad, 0)
         if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
             if state.pushed_max_cycles == 0:
-                state.pushed_max_cycles = SHAKEN_CYCLES if state.shaken != 0 else PUSHED_CYCLES
+                longest = SHAKEN_CYCLES if state.shaken != 0 else PUSHED_CYCLES
+                state.pushed_max_cycles = max(longest, limits.frozen_cycles)
             state.pushed_cycles += 1
             if state.pushed_cycles > state.pushed_max_cycles:
                 trip(state, Fault.POSITION_FROZEN, way_rad, 0)

@@ -60,7 +60,7 @@ MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # feed-forward a healthy joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
 FROZEN_FRICTION = 1.5  # times the static friction: what a healthy joint does not stand still under
-FROZEN_WAYS = 2.0  # of the tolerance, that what is beyond the friction moves a rigid joint by in PUSHED_CYCLES
+FROZEN_WAYS = 2.0  # of the tolerance, that what is beyond the friction moves a rigid joint by before it counts
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
 MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
@@ -335,15 +335,15 @@ def _fill_limits(record: LimitConstants, config: Config) -> None:
         "torque_rate_max_Nmps", "following_error_max_rad", "position_jump_max_rad", "standstill_radps",
     )  # fmt: skip
     share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
+    record.frozen_tolerance_rad = FROZEN_COUNTS * law_resolution_rad(config)
+    record.frozen_cycles = PUSHED_CYCLES
     static_Nm = static_friction_Nm(config)
     if static_Nm is not None:
-        # a heavy joint takes more to leave the tolerance in time
-        pushed_s = PUSHED_CYCLES / config.loop.rate_Hz
-        leaves_Nm = (
-            FROZEN_WAYS * 2.0 * config.joint.inertia_kgm2 * FROZEN_COUNTS * law_resolution_rad(config) / pushed_s**2
-        )
-        record.frozen_torque_Nm = static_Nm + max((FROZEN_FRICTION - 1.0) * static_Nm, leaves_Nm)
-        record.frozen_torque_Nm += abs(config.joint.gravity_Nm)
+        record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
+        if static_Nm > 0.0:  # a heavy joint leaves the tolerance later
+            pushes_radps2 = (FROZEN_FRICTION - 1.0) * static_Nm / config.joint.inertia_kgm2
+            leaves_s = math.sqrt(2.0 * FROZEN_WAYS * record.frozen_tolerance_rad / pushes_radps2)
+            record.frozen_cycles = max(PUSHED_CYCLES, math.ceil(leaves_s * config.loop.rate_Hz))
     second = config.joint_encoder
     if second is not None:
         record.disagreement_max_rad = second.disagreement_max_rad
@@ -351,7 +351,6 @@ def _fill_limits(record: LimitConstants, config: Config) -> None:
         record.limit_source = LimitSource.BOTH
         if second.limits != "both":
             record.limit_source = LimitSource.LAW if second.limits == second.law else LimitSource.OTHER
-    record.frozen_tolerance_rad = FROZEN_COUNTS * law_resolution_rad(config)
     record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
     record.frozen_ahead_rad = record.frozen_max_rad
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)

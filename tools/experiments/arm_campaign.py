@@ -30,7 +30,6 @@ from typing import Any
 import numpy as np
 
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.safety import PUSHED_CYCLES
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
@@ -274,7 +273,7 @@ def _misread(
         friction = constants.law.friction
         viscous = min(friction.positive.viscous_Nmspr, friction.negative.viscous_Nmspr)
         blind = float(constants.limits.frozen_torque_Nm / (viscous * config.joint.reduction_ratio))
-        pushed = _drive_Nm(config) / config.joint.inertia_kgm2 * PUSHED_CYCLES / config.loop.rate_Hz
+        pushed = _drive_Nm(config) / config.joint.inertia_kgm2 * constants.limits.frozen_cycles / config.loop.rate_Hz
         return BLIND_RAD * (blind + pushed) / BLIND_RADPS, blind + pushed
     return 0.0, 0.0
 

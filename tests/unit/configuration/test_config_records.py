@@ -17,6 +17,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py import friction as friction_model
 from jointctl.firmware_py.observers import step_velocity
 from jointctl.firmware_py.records import VelocityState
+from jointctl.firmware_py.safety import PUSHED_CYCLES
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
@@ -225,14 +226,16 @@ def test_the_velocity_of_one_count_is_what_the_filter_makes_of_it(
     assert velocity_of_a_count_radps(config) == pytest.approx(state.velocity_radps)
 
 
-def test_a_reading_that_stands_is_pushed_by_what_moves_a_heavy_joint_out_of_its_tolerance(tmp_path: Path) -> None:
-    """20 cycles at that torque, less friction: more than four counts, however heavy the joint is."""
-    for inertia, counts in ((2.1, 524288), (60.0, 65536)):
+def test_a_reading_that_stands_counts_when_the_joint_must_have_left_its_tolerance(tmp_path: Path) -> None:
+    """However heavy it is, and however coarse its counts are."""
+    for inertia, counts, cycles in ((2.1, 524288, PUSHED_CYCLES), (60.0, 65536, None)):
         text = VIRTUAL.replace("inertia_kgm2 = 2.1", f"inertia_kgm2 = {inertia}")
         config = load(tmp_path, "counts_per_turn = .*", f"counts_per_turn = {counts}", text)
         limits = constants_of(config)[0].limits
         static_Nm = static_friction_Nm(config)
         assert static_Nm is not None
-        way_rad = 0.5 * (limits.frozen_torque_Nm - static_Nm) / inertia * (20.0 / config.loop.rate_Hz) ** 2
+        assert limits.frozen_torque_Nm == pytest.approx(1.5 * static_Nm)
+        pushed_s = limits.frozen_cycles / config.loop.rate_Hz
+        way_rad = 0.5 * (limits.frozen_torque_Nm - static_Nm) / inertia * pushed_s**2
         assert way_rad > 1.9 * limits.frozen_tolerance_rad
-        assert limits.frozen_torque_Nm >= 1.5 * static_Nm
+        assert cycles is None or limits.frozen_cycles == cycles
