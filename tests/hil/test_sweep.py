@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,9 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DECLINED, DataError, DeviceError, MotionFault
-from jointctl.firmware_py import kernel
 from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.sweeping import carry_out
 from jointctl.tools.sweeping.options import SweepOptions, SweepPoint
 from jointctl.tools.verbs.sweep import Sweep, sweep
 from tests.configurations import changed
@@ -139,19 +136,6 @@ def test_the_same_sweep_twice_gives_the_same_rows(config: Config, tmp_path: Path
     first = swept(config, tmp_path / "a.csv", points=4, shuffle_seed=3)
     second = swept(config, tmp_path / "b.csv", points=4, shuffle_seed=3)
     assert np.array_equal(first["motor_torque_Nm"], second["motor_torque_Nm"])
-
-
-def test_a_simulation_that_compiles_says_so(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told, _, err = output()
-
-    def compiled(*_: object) -> None:
-        kernel._told[-1]()
-        while not err.getvalue():
-            time.sleep(0.01)
-
-    monkeypatch.setattr(carry_out, "sweep_in_lockstep", compiled)
-    assert sweep(config, told, tmp_path / "data.csv", SweepOptions(lockstep=True, points=4)) == DECLINED
-    assert err.getvalue().startswith("simulation: compiling")
 
 
 def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) -> None:
