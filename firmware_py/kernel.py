@@ -146,7 +146,7 @@ def _one_process(lock: Path) -> Iterator[None]:
         if file is not None:
             with contextlib.suppress(OSError):
                 lock.unlink(missing_ok=True)
-                flock(file, LOCK_UN)  # also for a child that was forked meanwhile
+                flock(file, LOCK_UN)  # also for a child that was forked in between
             os.close(file)
 
 

@@ -1,4 +1,4 @@
-"""That compiling takes its time: noticed where a kernel is compiled, told by the command that waits for it.
+"""That compiling takes its time: noticed where a kernel is compiled, reported by the command that waits for it.
 
 Apart from `kernel`, which takes a tenth of a second to load: not every command has kernels.
 """
@@ -11,18 +11,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 
-SLOW_START_S = 2.0  # compiling for so long is told
+SLOW_START_S = 2.0  # compiling for so long is reported
 _waiting: list[Callable[[], AbstractContextManager[None]]] = []
 
 
 @contextlib.contextmanager
 def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[None]:
     """Tells once that `who` compiles, as soon as it has for `after_s` within; loading from the cache does not count."""
-    left_s, told = after_s, False
+    left_s, said = after_s, False
 
     def say() -> None:
-        nonlocal told
-        told = True
+        nonlocal said
+        said = True
         tell(f"{who}: compiling, which only the first start does")
 
     @contextlib.contextmanager
@@ -30,7 +30,7 @@ def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_ST
         nonlocal left_s
         timer, began_s = threading.Timer(max(left_s, 0.0), say), time.monotonic()
         timer.daemon = True
-        if not told:
+        if not said:
             timer.start()
         try:
             yield

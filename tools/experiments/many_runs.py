@@ -43,7 +43,7 @@ class Workers:
     def results(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
         """`function` of each task, in the order in which they are done; closing it ends the work early."""
         left = iter(tasks)
-        if self.cluster is None:  # what the first one compiles the processes load, and only here can it be told
+        if self.cluster is None:  # what the first one compiles the processes load, and only here can it be said
             yield from map(function, left if self.count == 1 else islice(left, 1))
             if self.count == 1:
                 return

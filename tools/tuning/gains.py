@@ -45,6 +45,7 @@ from jointctl.tools.analysis.linear_loop import (
     two_masses,
 )
 from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
+from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
@@ -402,7 +403,7 @@ def _control(config: Config, control: Control) -> Control:
     elif config.friction.lugre is None and feed_forward == "lugre_desired":
         feed_forward = "desired"
     adaptation, paired = None, False
-    observes = control.kind in ("computed_torque_observer", "flexible_joint")
+    observes = control.kind in OBSERVING_LAWS
     if observes and feed_forward == "lugre_desired":
         adaptation = config.control.adaptation or Adaptation()
         paired = control.kind != "flexible_joint"  # which pairs anyway
