@@ -12,8 +12,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -83,6 +83,30 @@ class Starting:
 def processors() -> int:
     """How many this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def keep_off(processor: int | None) -> dict[int, set[int]]:
+    """All threads of this process, and what they start, keep off a processor where there is another.
+
+    Gives where each of them was allowed to run before, for `let_run`.
+    """
+    before: dict[int, set[int]] = {}
+    if processor is None or not hasattr(os, "sched_setaffinity"):
+        return before
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with suppress(OSError):  # one that has ended in the meantime
+            allowed = os.sched_getaffinity(thread)
+            if others := allowed - {processor}:
+                os.sched_setaffinity(thread, others)
+                before[thread] = allowed
+    return before
+
+
+def let_run(allowed: Mapping[int, set[int]]) -> None:
+    """Each thread on the processors that `keep_off` has found."""
+    for thread, processors_of_it in allowed.items():
+        with suppress(OSError):
+            os.sched_setaffinity(thread, processors_of_it)
 
 
 @contextmanager

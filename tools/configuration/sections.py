@@ -208,7 +208,7 @@ class Sequence(Section):
 
 class Loop(Section):
     rate_Hz: Annotated[float, between(10.0, 10_000.0)]  # over CAN [100..4000], and what the bus carries
-    cpu: Annotated[int, between(0, 1023)] | None = None  # processor of the loop (isolcpus); none = any
+    cpu: Annotated[int, between(0, 1023)] | None = None  # processor of the loop, left by its supervisor; none = any
     priority: Annotated[int, between(1, 98)] | None = None  # SCHED_FIFO; none = ordinary scheduling
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from jointctl.drivers.errors import DataError, one_line, printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.child_process import keep_off
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import CDR_HEADER, JOINT_NAMES, StateCycles, event_body, joint_states
 from jointctl.tools.recording.run_log import Event
@@ -231,10 +232,7 @@ class WayBack:
 def stand_aside(loop_cpu: int | None) -> None:
     """Niced, and off the loop's processor where that is fixed and there is another."""
     os.nice(NICE)
-    if loop_cpu is not None:
-        with contextlib.suppress(OSError):
-            if others := os.sched_getaffinity(0) - {loop_cpu}:
-                os.sched_setaffinity(0, others)
+    keep_off(loop_cpu)
 
 
 def serve_order(serve: Callable[[RemoteOrder], None]) -> int:

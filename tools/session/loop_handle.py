@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
-from jointctl.tools.child_process import Starting
+from jointctl.tools.child_process import Starting, keep_off, let_run
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.session.loop_memory import LoopOrder, new_block
 
@@ -41,6 +41,7 @@ class LoopHandle:
     when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
+    _allowed: Mapping[int, set[int]] = {}  # where the threads of this process could run before `go`
     _cycle_ns = _looked_ns = _stood_ns = 0  # of `_hung_ns`
 
     def __init__(
@@ -52,6 +53,7 @@ class LoopHandle:
         self._tail = 0
         self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
+        self._processor = config.loop.cpu
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
             supervisor_pid=os.getpid(),
@@ -85,6 +87,7 @@ class LoopHandle:
 
     def __exit__(self, *_: object) -> None:
         """A loop that still runs gets the word to switch off, and is killed only if it does not listen."""
+        let_run(self._allowed)
         if self._process.poll() is None:
             self.request_stop(StopRequest.OFF)
             try:
@@ -135,7 +138,8 @@ class LoopHandle:
         self.block.words[Word.LISTEN] = 1
 
     def go(self, constants: np.recarray, port: np.recarray) -> None:
-        """Hand over the constants and the driver's memory, and let the loop begin."""
+        """Hand over the constants and the driver's memory, and let the loop begin, alone on `loop.cpu`."""
+        self._allowed = keep_off(self._processor)
         self.block.constants[:] = constants
         self.block.port[:] = port
         for axis in range(self.block.axes):

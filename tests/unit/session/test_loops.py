@@ -19,22 +19,28 @@ from typing import Any
 import pytest
 import typer
 
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.slow_start import compiling, slow_start
-from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_time_s
+from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, keep_off, processor_time_s, processors
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.output import Output
 from jointctl.tools.session import elmo_drive as module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
+from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs import verb_options
 from jointctl.tools.verbs.verb_options import VerbOutput, grouped
+from tests.configurations import changed
 from tests.places import CONFIGS, ROOT
+from tests.sessions import constants_of
 
 
 # --- The word about a slow start comes when it is slow because it compiles, and never after its end ---
@@ -89,6 +95,35 @@ def test_of_many_runs_the_first_compiles_where_it_can_be_said() -> None:
     first, *others = Workers(2).results(own_process, range(3))
     assert first == os.getpid()
     assert first not in others
+
+
+# --- The processor that is the loop's ---
+@pytest.mark.skipif(processors() < 2, reason="this computer has one processor")
+def test_every_thread_keeps_off_the_loops_processor_from_its_go_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: SimpleNamespace(poll=lambda: 0))
+    allowed, ended = os.sched_getaffinity(0), threading.Event()
+    thread = threading.Thread(target=ended.wait, daemon=True)
+    thread.start()
+
+    def seen() -> list[set[int]]:
+        return [os.sched_getaffinity(each) for each in (0, thread.native_id) if each is not None]
+
+    config = changed(load_config(CONFIGS / "virtual.toml"), loop__cpu=max(allowed))
+    with LoopHandle(config, trajectory_table(config), CanopenPort) as loop:
+        before = seen()
+        loop.go(constants_of(config), new(CanopenPort))
+        during = seen()
+    after = seen()
+    ended.set()
+    thread.join()
+    assert (before, during, after) == ([allowed] * 2, [allowed - {max(allowed)}] * 2, [allowed] * 2)
+
+
+def test_a_processor_that_is_not_chosen_or_not_there_changes_nothing() -> None:
+    allowed = os.sched_getaffinity(0)
+    assert keep_off(None) == {}
+    keep_off(1 + max(allowed))
+    assert os.sched_getaffinity(0) == allowed
 
 
 # --- Waiting for a process that compiles: as long as it works, and in words when it ends or hangs ---
