@@ -4,8 +4,9 @@ Where the motor goes at constant speed, every whole motor turn gives one estimat
 and sines of 1 to HIGHEST periods a turn, of the difference of both encoders and of the torque.  The offset takes what
 hysteresis and friction do, the slope what changes slowly.  Where the joint swings instead of being held, its inertia
 and the slope of the friction against the speed have taken part of the torque, and the link's inertia has twisted the
-reducer: that is added.  The mean over the turns of both directions is the result.  Its interval of 95 % has their
-spread, and that what was added is known to STIFFNESS_ERROR and TORQUE_ERROR.
+reducer: that is added.  The mean over the turns of both directions is the result.  What friction, hysteresis and
+counts do to one turn they do to the next in much the same way, so that the mean is not known better than one turn: the
+interval of 95 % has the spread of single turns, and that what was added is known to STIFFNESS_ERROR and TORQUE_ERROR.
 
     eps(theta) = sum a_k sin(k n theta + phi_k)    by which the link is ahead of the motor, both as their encoders read
     r(theta)   = sum c_k sin(k n theta + phi_k)    torque that the motor gets besides, positive towards positive angle
@@ -37,7 +38,7 @@ HIGHEST = 12  # periods a motor turn that are looked for
 LEAST_TURNS = 4  # of the motor at constant speed, both directions together
 LEAST_ROWS = 8 * HIGHEST  # of a turn: fewer do not tell its sines apart
 LEVEL = 0.95
-STIFFNESS_ERROR = 0.3  # share by which it is known, hysteresis included: that of `margin.stiffness_error`
+STIFFNESS_ERROR = 0.5  # share by which it is known: hysteresis up to doubles it for a swing
 TORQUE_ERROR = 0.15  # the same of inertia and of the slope of the friction
 _STEADY = 1e-3  # share of the speed by which a row of constant speed may be off
 _LARGEST_SPREAD = 3.0  # amplitudes below this many standard errors are no part of a map
@@ -152,13 +153,14 @@ def _waves(parts: np.ndarray, error: float) -> tuple[Wave, ...]:
         amplitude = abs(mean)
         turned = estimates[:, k] * np.exp(-1j * np.angle(mean))
         along, across = np.std(turned.real, ddof=1), np.std(turned.imag, ddof=1)
-        along_half, across_half = (math.hypot(width * float(spread), doubt[k]) for spread in (along, across))
+        turn = math.hypot(along, across)
+        along_half, across_half = (math.hypot(max(width * float(one), turn), doubt[k]) for one in (along, across))
         half = across_half / amplitude if amplitude > 0.0 else math.pi
-        noise = math.hypot(along, across) / math.sqrt(count)
+        least = max(_LARGEST_SPREAD * turn / math.sqrt(count), math.hypot(width * along, doubt[k]))
         waves.append(
             Wave(
                 k + 1, float(amplitude), along_half, float(np.angle(mean)), min(half, math.pi),
-                bool(amplitude > max(_LARGEST_SPREAD * noise, along_half) and _predicts(estimates[:, k])),
+                bool(amplitude > least and _predicts(estimates[:, k])),
             )
         )  # fmt: skip
     return tuple(waves)

@@ -82,6 +82,14 @@ def test_intervals_hold_about_as_often_as_they_say() -> None:
     assert 0.88 <= np.mean(inside) <= 1.0
 
 
+def test_the_interval_holds_what_friction_does_alike_to_every_turn_of_a_direction() -> None:
+    made = made_run(swing=0.0)
+    assert made.link_rad is not None
+    forwards = np.where(made.desired_radps > 0.0, 0.01, 0.0) * series({4: ERROR[4]}, made.motor_rad)
+    found = found_map(replace(made, link_rad=made.link_rad + forwards)).kinematic_rad[3]
+    assert abs(found.amplitude - ERROR[4][0]) <= found.amplitude_half <= 0.02 * ERROR[4][0]
+
+
 def test_what_the_links_inertia_twists_the_reducer_is_added_and_the_interval_holds_a_stiffness_that_is_wrong() -> None:
     """A link whose swing on the reducer makes 14 % of the wave of four periods."""
     omega_radps, soft = 4.0 * RATIO * SPEED, 1.8e3
