@@ -155,6 +155,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "or an encoder of too little resolution",
         "run `jointctl check`; then lower the gains (kp, kv, observer_radps), switch learning off, "
         "or measure with more counts",
+        follows_pause=True,
     ),
     Fault.CLIENT_SILENT: FaultWords(
         "the program that commands the joint was silent for {value:.2f} s",

@@ -105,9 +105,10 @@ def check_cascade(
     config: Config, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False
 ) -> int:
     """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
+    from jointctl.drivers.canopen.eds import read_eds
     from jointctl.tools.analysis.linear_loop import loop_settings
     from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_of, cascade_unknowns, require_cascade
-    from jointctl.tools.configuration.canopen import canopen_section
+    from jointctl.tools.configuration.canopen import canopen_section, eds_path
     from jointctl.tools.verbs.bench_drive import bench_of
 
     section, cascade = canopen_section(config), cascade_of(config)
@@ -119,11 +120,13 @@ def check_cascade(
     with_target = section.sent_with_target(config.loop.rate_Hz)
     lead = with_target.lead_s if with_target is not None else 0.0
     table.add_row("lead", f"{lead * 1e3:g} ms", "by which the motion is sent ahead (drive.cascade.lead_s)")
-    sent = {
-        "torque offset": cascade.torque_offset,
-        "velocity offset": cascade.velocity_offset and section.mode == "csp",
-    }
-    table.add_row("sent besides the target", ", ".join(k for k, on in sent.items() if on) or "nothing", "60B2, 60B1")
+    offsets = {0x60B2: ("torque offset", cascade.torque_offset),
+               0x60B1: ("velocity offset", cascade.velocity_offset and section.mode == "csp")}  # fmt: skip
+    known = read_eds(eds_path(config), section.node).dictionary
+    sent = [f"{what} ({index:X})" for index, (what, on) in offsets.items() if on and index in known]
+    missing = [f"{index:X}" for index, (_, on) in offsets.items() if on and index not in known]
+    note = f"{section.eds} has no {' and no '.join(missing)}" if missing else ""
+    table.add_row("sent besides the target", ", ".join(sent) or "nothing", note)
     table.add_section()
     found = cascade_margins(config, delay.value)
     for loop in found:

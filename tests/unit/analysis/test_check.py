@@ -28,6 +28,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.configurations import changed, shipped
+from tests.places import CONFIGS
 
 
 # --- `check`: table, JSON, verdict, remedies and picture; where each assumption comes from ---
@@ -93,6 +94,15 @@ def test_too_small_a_margin_is_refused_with_numbers() -> None:
         "control.learning_rate = 69.5",
     ):
         assert remedy in messages
+
+
+def test_what_is_sent_to_a_drive_that_closes_its_own_loop_is_what_its_eds_has(tmp_path: Path) -> None:
+    both, *_ = run_check(shipped("csp"))
+    assert "torque offset (60B2), velocity offset (60B1)" in both
+    eds = tmp_path / "drive.eds"
+    eds.write_text((CONFIGS / "virtual_joint.eds").read_text().replace("60B1", "60AF"))
+    without, *_ = run_check(changed(shipped("csp"), drive__eds=str(eds)))
+    assert re.search(r"sent besides the target\W+torque offset \(60B2\)\W+[^│]*drive.eds has no 60B1", without)
 
 
 def test_an_unstable_loop_is_called_so_and_its_json_is_valid() -> None:

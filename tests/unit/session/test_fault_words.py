@@ -220,6 +220,10 @@ def test_a_long_cycle_before_a_leap_is_told(field: str, pause_ns: int, expected:
     assert told(Fault.VELOCITY_LIMIT, 1.9, paused_records(Fault.VELOCITY_LIMIT, **{field: (178, pause_ns)})) is expected
 
 
+def test_a_loop_that_swings_on_a_late_computer_is_not_blamed_on_its_gains_alone() -> None:
+    assert told(Fault.LIMIT_CYCLE, 9.0, paused_records(Fault.LIMIT_CYCLE, skipped=(FAULTY, 4)))
+
+
 def test_at_a_high_rate_three_cycles_are_no_pause() -> None:
     records = paused_records(Fault.VELOCITY_LIMIT, skipped=(FAULTY, 4))
     assert held_up_text(Fault.VELOCITY_LIMIT, 1.9, TEXT, records, 1000.0) == TEXT
