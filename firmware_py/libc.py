@@ -31,6 +31,7 @@ def external(name: str, result: str, *arguments: str) -> Any:
 clock_nanosleep = external("clock_nanosleep", "int32", "int32", "int32", "uintp", "uintp")
 clock_gettime = external("clock_gettime", "int32", "int32", "uintp")
 send = external("send", "intp", "int32", "uintp", "uintp", "int32")
+sendmmsg = external("sendmmsg", "int32", "int32", "uintp", "int32", "int32")
 recv = external("recv", "intp", "int32", "uintp", "uintp", "int32")
 ppoll = external("ppoll", "int32", "uintp", "uintp", "uintp", "uintp")
 accept4 = external("accept4", "int32", "int32", "uintp", "uintp", "int32")

@@ -29,7 +29,16 @@ from jointctl.drivers.canopen.cyclic import (
 from jointctl.drivers.drive import LOOK_LATE_NS
 from jointctl.firmware_py.cycle import Near, fetch, nothing_near
 from jointctl.firmware_py.kernel import exported, kernel
-from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, monotonic_ns, wait_watched_ns, watch
+from jointctl.firmware_py.libc import (
+    EINTR,
+    MSG_DONTWAIT,
+    MSG_NOSIGNAL,
+    errno,
+    monotonic_ns,
+    sendmmsg,
+    wait_watched_ns,
+    watch,
+)
 from jointctl.firmware_py.libc import recv as receive_bytes
 from jointctl.firmware_py.libc import send as send_bytes
 from jointctl.firmware_py.records import Sample
@@ -88,6 +97,33 @@ def receive_frame(fd: int, frames: np.ndarray, index: int) -> int:
             return -int(code)
 
 
+HEADER_BYTES = 64
+
+
+class Batch(NamedTuple):
+    """The last frame of each drive in a cycle, so that those of a bus go to the system in one call (sendmmsg(2))."""
+
+    frames: Any  # Frame[axes]
+    headers: np.ndarray  # int64[axes, 8]: struct mmsghdr of a 64-bit system, each with one part
+    parts: np.ndarray  # int64[axes, 2]: struct iovec, each the frame
+
+
+def batch_of(count: int) -> Batch:
+    batch = Batch(new(Frame, count), np.zeros((count, 8), np.int64), np.zeros((count, 2), np.int64))
+    batch.parts[:, 0] = batch.frames.ctypes.data + FRAME_BYTES * np.arange(count)
+    batch.parts[:, 1] = FRAME_BYTES
+    batch.headers[:, 2] = batch.parts.ctypes.data + batch.parts.strides[0] * np.arange(count)
+    batch.headers[:, 3] = 1
+    return batch
+
+
+@kernel
+def send_batch(fd: int, batch: Batch, first: int, count: int) -> int:
+    """How many of these frames the bus has taken, from the first one on; why not the next one, `send_frame` tells."""
+    address = np.uintp(batch.headers.ctypes.data + first * HEADER_BYTES)
+    return max(int(sendmmsg(np.int32(fd), address, np.int32(count), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))), 0)
+
+
 # --- The exchange ---
 
 
@@ -100,13 +136,14 @@ class CanopenLink(NamedTuple):
     port: Any  # CanopenPort[axes]
     frames: Any  # Frame[FRAME_SLOTS]
     scratch: np.ndarray  # int64[SCRATCH_WORDS or more]
+    batch: Batch
     near: Near = nothing_near()
 
 
 def link_of(port: np.recarray, near: Near | None = None) -> CanopenLink:
     """`port` CanopenPort[axes] with the other memory of the exchange."""
     scratch = np.zeros(max(SCRATCH_WORDS, len(port) + 3), np.int64)
-    return CanopenLink(port, new(Frame, FRAME_SLOTS), scratch, near or nothing_near())
+    return CanopenLink(port, new(Frame, FRAME_SLOTS), scratch, batch_of(len(port)), near or nothing_near())
 
 
 @kernel
@@ -222,17 +259,28 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
 
 @exported
 def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
-    """Send the RPDO of each drive; returns 0 or the last errno."""
-    ports, failed = link.port, 0
+    """Send the RPDO of each drive, those of neighbours on a bus in one call; returns 0 or the last errno."""
+    ports, batch, failed = link.port, link.batch, 0
     for axis in range(len(ports)):
         end_cycle(ports[axis], link.frames, samples[axis], commands[axis])
-        fd = ports[ports[axis].bus].fd
         if ports[axis].offset_rpdo_id != 0:
-            _note_sent(ports[axis], samples[axis], send_frame(fd, link.frames, SLOT_OFFSET), False)
-        error = send_frame(fd, link.frames, SLOT_RPDO)
-        _note_sent(ports[axis], samples[axis], error, True)
-        if error != 0:
-            failed = error
+            error = send_frame(ports[ports[axis].bus].fd, link.frames, SLOT_OFFSET)
+            _note_sent(ports[axis], samples[axis], error, False)
+        batch.frames[axis] = link.frames[SLOT_RPDO]
+    first = 0
+    while first < len(ports):
+        bus, last = ports[first].bus, first + 1
+        while last < len(ports) and ports[last].bus == bus:
+            last += 1
+        fd, taken = ports[bus].fd, 0
+        if last - first > 1:
+            taken = send_batch(fd, batch, first, last - first)
+        for axis in range(first, last):
+            error = 0 if axis < first + taken else send_frame(fd, batch.frames, axis)
+            _note_sent(ports[axis], samples[axis], error, True)
+            if error != 0:
+                failed = error
+        first = last
     return np.int32(failed)  # type: ignore[return-value]
 
 

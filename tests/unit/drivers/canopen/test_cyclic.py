@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import math
+import os
 import socket
 import struct
 import threading
@@ -198,7 +200,7 @@ def test_whatever_the_torque_the_object_stays_in_its_limit(torque_Nm: float, lim
 
 # --- the exported half of the lockstep simulation ---
 def test_exchange_memory_has_room_for_every_slot(wire: Wire) -> None:
-    _, frames, scratch, _ = exchange.link_of(wire.ports)
+    _, frames, scratch, *_ = exchange.link_of(wire.ports)
     assert (len(frames), frames.dtype.itemsize, len(scratch)) == (FRAME_SLOTS, 16, SCRATCH_WORDS)
     assert scratch.dtype == np.int64
 
@@ -503,6 +505,27 @@ def test_its_twin_a_drive_that_does_not_answer_costs_the_window_and_not_the_othe
 def test_a_drive_that_ignores_a_stop_costs_both_the_heartbeat(two_drives: TwoDrives, deaf: int) -> None:
     two_drives.ports[deaf].ignored_cycles = IGNORED_MAX_CYCLES + 1
     assert two_drives.cycle(30.0, 0, 1)[1] == [0x80, 0x205, 0x206]
+
+
+@pytest.mark.parametrize("room", [0, 1, 2])
+def test_what_the_queue_does_not_take_is_an_error_of_its_own_drive(two_drives: TwoDrives, room: int) -> None:
+    """RPDOs go out in one call, which may take the first ones only."""
+    ours = socket.socket(fileno=os.dup(int(two_drives.ports[0].fd)))
+    with ours, contextlib.suppress(BlockingIOError):
+        while True:
+            ours.send(bytes(16), socket.MSG_DONTWAIT)
+    for _ in range(room):
+        two_drives.bus.recv(16)
+    for axis, port in enumerate(two_drives.ports):
+        port.rpdo_filler[:] = 10 + axis
+    failed = exchange.send(two_drives.link, two_drives.samples, two_drives.commands)
+    assert failed == (0 if room == 2 else errno.EAGAIN)
+    assert list(two_drives.samples["bus_errors"]) == [int(axis >= room) for axis in range(2)]
+    frames = []
+    with contextlib.suppress(BlockingIOError):
+        while frame := two_drives.bus.recv(16, socket.MSG_DONTWAIT):
+            frames.append((*struct.unpack_from("<I", frame), frame[15]))
+    assert [frame for frame in frames if frame[0]] == [(0x205, 10), (0x206, 11)][:room]
 
 
 class TwoBuses(TwoDrives):
