@@ -13,6 +13,7 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import newton_euler
+from jointctl.firmware_py.kernel import bound
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import reference_at
@@ -146,19 +147,20 @@ def pose_models(arm: ArmConfig) -> tuple[np.ndarray, np.ndarray]:
     position_rad, acceleration_radps2, torque_Nm = (
         memory.motion[name][:axes] for name in ("position_rad", "acceleration_radps2", "torque_Nm")
     )
+    find_torques = bound(newton_euler, memory)
     inertias, loads = [], []
     for pose in poses(arm):
         position_rad[:] = pose
         gravity_mps2[:] = arm.arm.gravity_mps2
         acceleration_radps2[:] = 0.0
-        newton_euler(memory)
+        find_torques()
         loads.append(torque_Nm.copy())
         gravity_mps2[:] = 0.0
         inertia = np.zeros((axes, axes))
         for axis in range(axes):
             acceleration_radps2[:] = 0.0
             acceleration_radps2[axis] = 1.0
-            newton_euler(memory)
+            find_torques()
             inertia[axis] = torque_Nm
         inertias.append(inertia)
     return np.array(inertias), np.array(loads)
@@ -197,6 +199,7 @@ def require_torques(
     memory = arm.model.memory()
     motion: Any = memory.motion
     reference: Any = new(Reference)[0]
+    find_torques = bound(newton_euler, memory)
     rows = [0] * len(trajectories)
     times_s = moments_s(duration_s)
     torques_Nm = np.zeros((len(times_s), len(trajectories)))
@@ -207,7 +210,7 @@ def require_torques(
             own = motion[axis]
             own.position_rad, own.velocity_radps = reference.position_rad, reference.velocity_radps
             own.acceleration_radps2 = reference.acceleration_radps2
-        newton_euler(memory)
+        find_torques()
         torques[:] = motion.torque_Nm[: len(torques)]
     for name, config, torques in zip(arm.names, arm.joints, torques_Nm.T, strict=True):
         worst, limit_Nm = int(np.argmax(np.abs(torques))), config.limits.torque_max_Nm
