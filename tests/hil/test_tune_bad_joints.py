@@ -21,10 +21,10 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import Motion, TerminalConsent
-from jointctl.tools.tuning.carry_out import Carried, Carrier
+from jointctl.tools.tuning.carry_out import Carried, Carrier, NotCarriedOut
 from jointctl.tools.verbs.tune import TuneOptions
 from jointctl.tools.verbs.tune_steps import Tune
-from tests.configurations import changed, written
+from tests.configurations import changed, shipped, written
 
 OFF = ("switch on disabled", "ready to switch on", "switched on", "fault")  # states of the drive without power
 
@@ -104,6 +104,48 @@ def test_a_fault_in_a_step_ends_it_in_one_line(tmp_path: Path, kind: str, at_s: 
     assert len([name for name in kept if name not in ("about", "asked")]) == steps
     if steps == 3:
         assert len((path.with_suffix(".tune") / "friction.csv").read_text().splitlines()) > 3
+
+
+class FirstStages(Watched):
+    """Ends with the first stage of the response that measured."""
+
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+        carried = super().run(config, motion, title, also_faults=also_faults)
+        if "response" in title and carried.text is None:
+            raise NotCarriedOut(self.drive_state)
+        return carried
+
+
+def too_light(inertia_kgm2: float) -> Config:
+    """2.1 kg m^2 that stick and slip, taken for less."""
+    config = shipped("realistic", reducer=None, virtual__friction_kind="stick_slip")
+    return changed(config, joint__inertia_kgm2=inertia_kgm2, virtual__inertia_scale=2.1 / inertia_kgm2)
+
+
+def test_a_law_that_is_too_weak_for_the_friction_is_helped_once(tmp_path: Path) -> None:
+    """An inertia of less than half: where a leg turned back the reference went 50 mrad before the torque had turned."""
+    carrier = watched(FirstStages)
+    with pytest.raises(NotCarriedOut):
+        Tune(too_light(0.8), TuneOptions(lockstep=True), carrier, tmp_path).carry_out("")
+    assert carrier.motions == 3  # the direction, and the first stage once more
+
+
+def test_a_law_that_is_far_too_weak_says_what_it_may_be(tmp_path: Path) -> None:
+    carrier = watched()
+    with pytest.raises(MotionFault, match="POSITION_FROZEN") as raised:
+        Tune(too_light(0.2), TuneOptions(lockstep=True), carrier, tmp_path).carry_out("")
+    assert "where joint.inertia_kgm2 (=0.2) is too small" in raised.value.hint
+    assert "the encoder or its cable is dead" in raised.value.hint
+    assert carrier.motions == 3
+
+
+def test_a_joint_that_stands_under_enough_torque_is_not_tried_again(tmp_path: Path) -> None:
+    path = written(tmp_path / "joint.toml", "realistic")
+    text = with_fault(path, "current_loop_dead", 6.0)
+    carrier = watched()
+    said, _ = ended(path, carrier, text)
+    assert "POSITION_FROZEN" in said
+    assert carrier.motions == 2
 
 
 @pytest.mark.parametrize(("since", "steps"), [(6, 5), (8, 6)])

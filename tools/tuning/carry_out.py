@@ -18,7 +18,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -56,6 +56,10 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
 
 
+class StoodStill(MotionFault):
+    """POSITION_FROZEN of a joint that was hardly pushed: the law is too weak for its friction."""
+
+
 class NotCarriedOut(Exception):
     """A motion that was declined or only shown (`stopped_by` ""), or stopped by the user; the drive is off."""
 
@@ -72,6 +76,13 @@ class Carried:
     fault: Fault
     text: FaultText | None
     log: str  # "" in simulated time
+
+
+def _ended(title: str, carried: Carried) -> MotionFault:
+    assert carried.text is not None
+    return MotionFault(
+        f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice
+    )
 
 
 @dataclass
@@ -92,9 +103,7 @@ class Carrier:
         """The records; `MotionFault` after a fault unless `also_faults`, `NotCarriedOut` where it was not begun."""
         carried = self._simulated(config, motion) if self.control is None else self._moved(config, motion, title)
         if carried.text is not None and not also_faults:
-            raise MotionFault(
-                f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice
-            )
+            raise _ended(title, carried)
         return carried
 
     def _simulated(self, config: Config, motion: Motion) -> Carried:
@@ -195,6 +204,8 @@ LEAST_LEGS, MOST_LEGS = 8, 100
 STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
 GROWTH = 2.0  # of the torque from stage to stage
 ENOUGH_COHERENCE = 0.98  # median over the lines
+STANDS_SHARE = 0.1  # of the way of the reference: what the other encoder may show of a joint that stands
+TOO_WEAK = "the law may be too weak for the friction where joint.inertia_kgm2 (={:g}) is too small"
 RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
 LEAST_CHANGE = 0.1  # of the inertia: a payload; what both intervals allow is none
 
@@ -295,6 +306,19 @@ def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
         )
 
 
+def _stood_still(config: Config, carried: Carried) -> bool:
+    """Whether both encoders stood while the reference went too far, under a torque that a joint may stand under."""
+    phase = carried.records.phase
+    rows = carried.records[(phase >= AxisPhase.APPROACH) & (phase <= AxisPhase.TRACKING)]
+    if carried.fault != Fault.POSITION_FROZEN or config.joint_encoder is None or not len(rows):
+        return False
+    limits = axis_constants(config, trajectory_table(config))[0].limits
+    moved = np.abs(rows.position_rad - rows.position_rad[-1]) > limits.frozen_tolerance_rad
+    stands = rows[np.flatnonzero(moved)[-1] + 1 :] if np.any(moved) else rows
+    other_rad, way_rad = np.ptp(stands.second_position_rad), np.ptp(stands.desired_position_rad)
+    return bool(other_rad < STANDS_SHARE * way_rad and abs(rows.command_torque_Nm[-1]) < limits.frozen_torque_Nm)
+
+
 def _stage(
     task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
@@ -302,7 +326,13 @@ def _stage(
     motion = task.motion(peak_Nm, pairs)
 
     def measured() -> tuple[FrequencyResponse, Any, ResponsePlan]:
-        carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
+        title = f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm"
+        carried = carrier.run(task.config, motion, title, also_faults=True)
+        if carried.text is not None:
+            ended = _ended(title, carried)
+            if _stood_still(task.config, carried):
+                raise StoodStill(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
+            raise ended
         return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
 
     try:

@@ -50,6 +50,7 @@ from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import (
     Carrier,
     NotCarriedOut,
+    StoodStill,
     VERIFY_s,
     measured_response,
     require_one_joint,
@@ -73,6 +74,7 @@ STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
+FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
@@ -238,7 +240,15 @@ class Tune:
     def _step_response(self) -> dict[str, Any]:
         config = self._before_friction()
         task = response_task(config, None, AS_IT_FITS.legs)
-        found, records, plan = measured_response(task, self.carrier)
+        try:
+            found, records, plan = measured_response(task, self.carrier)
+        except StoodStill:  # a law for an inertia that is too small turns the friction round too late
+            self.carrier.output.note("  it stood still: once more, with a part of its friction fed forward")
+            static_Nm = static_friction_Nm(config) or 0.0
+            fed_Nm = FED_SHARE * static_Nm
+            config = with_sliding(config, static_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
+            task = response_task(config, None, AS_IT_FITS.legs)
+            found, records, plan = measured_response(task, self.carrier)
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
         fit = fit_joint(found, config.joint.inertia_kgm2)

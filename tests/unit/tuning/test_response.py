@@ -365,9 +365,9 @@ def test_a_stage_whose_legs_were_lost_is_measured_once_more(
             raise DataError("legs that were measured (=3) must be at least 4")
         return "response"
 
-    def run(_: Any, __: Any, title: str) -> Any:
+    def run(_: Any, __: Any, title: str, *, also_faults: bool) -> Any:
         runs.append(title)
-        return SimpleNamespace(records="records")
+        return SimpleNamespace(records="records", text=None)
 
     monkeypatch.setattr(carry_out, "response_of", response_of)
     carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=said.append))
