@@ -106,6 +106,12 @@ class TwoMasses:
     def resonance_Hz(self) -> float:
         return math.sqrt(self.stiffness_Nmprad * (1.0 / self.motor_kgm2 + 1.0 / self.link_kgm2)) / math.tau
 
+    @property
+    def critical_Nmspr(self) -> float:
+        """The damping with which both masses would come to rest without a swing."""
+        reduced = self.motor_kgm2 * self.link_kgm2 / (self.motor_kgm2 + self.link_kgm2)
+        return 2.0 * math.sqrt(self.stiffness_Nmprad * reduced)
+
 
 @dataclass(frozen=True)
 class RigidJoint:

@@ -332,9 +332,7 @@ def _margin(name: str, omega: np.ndarray, response: np.ndarray, inner_stable: bo
 
 def _shafts(joint: TwoMasses, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angles of (motor, link) over the motor's torque [rad/Nm]."""
-    reduced = joint.motor_kgm2 * joint.link_kgm2 / (joint.motor_kgm2 + joint.link_kgm2)
-    critical = 2.0 * math.sqrt(joint.stiffness_Nmprad * reduced)
-    reducer = joint.stiffness_Nmprad + max(joint.damping_Nmspr, _LEAST_DAMPING * critical) * s
+    reducer = joint.stiffness_Nmprad + max(joint.damping_Nmspr, _LEAST_DAMPING * joint.critical_Nmspr) * s
     motor, link = (
         inertia * s**2 + damping * s + held + reducer
         for inertia, damping, held in zip(

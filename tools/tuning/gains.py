@@ -2,19 +2,19 @@
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
                                                             and lag at the late end, link at both ends of the payload
-    phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, and one as stiff as under
-    |S| <= margin.max_sensitivity of a soft joint           a steady torque, which no hysteresis holds
+    phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
+    |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
     torque noise of the encoders' counts <= a share of limits.torque_max_Nm; with both encoders, as in
                                             `flexible_gains`, at most some 0.8 Nm from cycle to cycle
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / RIPPLE_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
 filter, then Nelder and Mead from its best points; kp follows from kv.  A joint that is late beside its resonance bears
-two to seven times the kv behind a filter far below that.  By this error a quick observer and a stiff loop
-look alike; on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit, and
-one far from the usual bandwidth costs a little: the error is flat there, and its least a matter of chance.  A
-goal that is missed costs in proportion, so that the result of a joint that does not allow all of them is the nearest
-one, and says so.
+two to seven times the kv behind a filter far below that; the link's speed, which the observer reads, is then filtered
+as well, since it drives a resonance that is hardly damped.  By this error a quick observer and a stiff loop look alike;
+on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit, and one far from
+the usual bandwidth costs a little: the error is flat there, and its least a matter of chance.  A goal that is missed
+costs in proportion, so that the result of a joint that does not allow all of them is the nearest one, and says so.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.states import Encoders
+from jointctl.firmware_py.states import ControllerKind, Encoders
 from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_NOISE_Nm, LARGEST_OBSERVER_radps
 from jointctl.tools.analysis.linear_loop import (
     Array,
@@ -66,6 +66,8 @@ LEAST_LATE_s = 0.1e-3
 GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
 TWO_ENCODERS = "[joint_encoder] beside an encoder on the motor"
 SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
+LEAST_DAMPING = 0.02  # of the critical one: of a strain wave gear without its hysteresis, 0.02 to 0.06
+LINK_CUTOFF = 2.0  # times the velocity filter: that of the link's velocity, at most
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for another
@@ -109,6 +111,8 @@ class Law:
         }
         if "cutoff_Hz" in values:
             values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
+            link_Hz = float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}")
+            values["link_cutoff_Hz"] = min(settings.link_cutoff_Hz, link_Hz)
         values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
         if "q" in values:
             values["q"] = (values["q"], values["q"])
@@ -252,6 +256,15 @@ def steady_joints(config: Config) -> list[TwoMasses]:
     return [two_masses(config, reducer, payload, softer, False) for payload in config.margin.payload_range]
 
 
+def lossless_joints(config: Config) -> list[TwoMasses]:
+    """Hardly damped, as soft and as stiff as hysteresis leaves it: the response does not tell its loss from damping."""
+    reducer = config.reducer
+    if reducer is None or reducer.loop_stiffness_Nmprad is None:
+        return []
+    joints = [two_masses(config, reducer, 1.0, stiffness, False) for stiffness in (SOFTEST, 1.0)]
+    return [replace(one, damping_Nmspr=min(one.damping_Nmspr, LEAST_DAMPING * one.critical_Nmspr)) for one in joints]
+
+
 def _payload_given(config: Config) -> bool:
     """Whether the file names a payload: the automatic range is that of a link behind a soft reducer."""
     return "payload_range" in config.margin.model_fields_set
@@ -272,9 +285,10 @@ class _Search:
         ]
         self._of_goals = len(joints)
         joints += [linear_loop(case).joint for case in cases(settings)]
+        # a law that damps the link by its own encoder would be left with hardly any gains
+        large = steady_joints(config) + (lossless_joints(config) if settings.encoders != Encoders.LINK else [])
         joints += [
-            sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders)
-            for joint in steady_joints(config)
+            sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders) for joint in large
         ]
         self._responses = np.array([joint.response(self._z) for joint in joints])
         plants = [joint.state_space() for joint in joints]
@@ -424,6 +438,8 @@ def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
         named["observer_radps"] = settings.observer_radps
     if "cutoff_Hz" in law.keys:
         named["velocity_cutoff_Hz"] = settings.cutoff_Hz
+    if settings.kind == ControllerKind.FLEXIBLE_JOINT:
+        named["link_cutoff_Hz"] = settings.link_cutoff_Hz
     if "q" in law.keys:
         named["lyapunov_q"] = settings.q
     return named

@@ -382,7 +382,6 @@ def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
         steady = rounded(fit.stiffness_Nmprad.value / SMALL_MOTION)
         remark = f"{steady:g}, loop_stiffness_Nmprad / {SMALL_MOTION:g}: not measured"
         values.append(Found(("reducer",), "stiffness_Nmprad", steady, remark))
-    reduced = joint.motor_kgm2 * joint.link_kgm2 / (joint.motor_kgm2 + joint.link_kgm2)
-    damping = min(joint.damping_Nmspr, CRITICAL_SHARE * 2.0 * (joint.stiffness_Nmprad * reduced) ** 0.5)
+    damping = min(joint.damping_Nmspr, CRITICAL_SHARE * joint.critical_Nmspr)
     values.append(found("reducer", "damping_Nmspr", fit.damping_Nmspr, damping))
     return values

@@ -13,7 +13,14 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
-from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains, converging, steady_joints
+from jointctl.tools.tuning.gains import (
+    SENSITIVITY,
+    PHASE_MARGIN_deg,
+    choose_gains,
+    converging,
+    lossless_joints,
+    steady_joints,
+)
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
@@ -81,13 +88,19 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     assert found.control.adaptation is not None
 
 
-@pytest.mark.parametrize(("joint", "kept"), [((2.1, 2.2e-3, 1.7, 2.6e4), True), ((2.0, 2.0e-3, 1.7, 5.0e4), False)])
+SLUGGISH = {"kp": 141.0, "kv": 9.68, "observer_radps": 27.4, "cutoff_Hz": 5.46, "link_cutoff_Hz": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("joint", "gains", "kept"),
+    [((2.1, 2.2e-3, 1.7, 2.6e4), {}, True), ((2.0, 2.0e-3, 1.7, 5.0e4), SLUGGISH, False)],
+)
 def test_learning_that_is_slow_at_one_frequency_is_kept_and_none_that_stands_still(
-    joint: tuple[float, float, float, float], kept: bool
+    joint: tuple[float, float, float, float], gains: dict[str, float], kept: bool
 ) -> None:
     """A factor of 0.9 was asked for, which no gains reach there: five of six soft joints did not learn at all."""
     fit = fit_of(*joint)
-    settings = choose_gains(known(shipped("realistic"), fit), fit).best.settings
+    settings = replace(choose_gains(known(shipped("realistic"), fit), fit).best.settings, **gains)
     learning = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
     found = converging(settings, learning)
     assert (found is not None) == kept
@@ -108,6 +121,23 @@ def test_a_joint_that_is_late_beside_its_resonance_gets_a_low_filter_and_passes_
     assert judged.sensitivity_peak <= config.margin.max_sensitivity
 
 
+def test_a_joint_whose_loss_is_all_hysteresis_keeps_its_margin_without_it() -> None:
+    """A light motor behind a filter of 10 Hz, kv 16: at the first slope and 2 % of the critical damping it swung."""
+    fit = fit_of(1.905, 2.57e-3, 1.496, 6.06e4)
+    fit = replace(fit, values={**fit.values, "damping_Nmspr": Estimate(20.0, 1.0)})
+    config = known(shipped("realistic", reducer__stiffness_Nmprad=3.79e4), fit)
+    found = choose_gains(config, fit)
+    assert found.missed == {}
+    assert found.control.kv > 8.0
+    settings, _ = loop_settings(changed(config, control=found.control))
+    for stiffness in (3.03e4, 3.6e4, 4.2e4, 6.06e4):
+        joint = replace(fit.joint(), stiffness_Nmprad=stiffness, bristle_damping_Nmspr=(0.0, 0.0))
+        joint = replace(joint, damping_Nmspr=0.02 * joint.critical_Nmspr)
+        judged = margins(replace(settings, joints=(joint,)))
+        assert judged.phase_margin_deg > 30.0
+        assert judged.sensitivity_peak < 3.5
+
+
 def test_the_gate_counts_a_joint_without_hysteresis_but_never_one_softer_than_that() -> None:
     config = known(shipped("realistic"), fit_of(2.1, 1.8e-3, 1.1, 2.6e4))
     assert config.reducer is not None
@@ -116,6 +146,15 @@ def test_the_gate_counts_a_joint_without_hysteresis_but_never_one_softer_than_th
         found = steady_joints(config.model_copy(update={"reducer": reducer}))
         assert [joint.stiffness_Nmprad for joint in found] == pytest.approx([stiffness] * 2)
     assert steady_joints(known(shipped("precise"), fit_of(2.0, 1.5e-3))) == []
+
+
+def test_joints_without_any_loss_are_hardly_damped() -> None:
+    fit = fit_of(2.1, 1.8e-3, 1.1, 2.6e4)
+    config = known(shipped("realistic"), replace(fit, values={**fit.values, "damping_Nmspr": Estimate(30.0, 1.0)}))
+    found = lossless_joints(config)
+    assert [joint.stiffness_Nmprad for joint in found] == pytest.approx([1.3e4, 2.6e4])
+    assert [joint.damping_Nmspr / joint.critical_Nmspr for joint in found] == pytest.approx([0.02] * 2)
+    assert lossless_joints(known(shipped("precise"), fit_of(2.0, 1.5e-3))) == []
 
 
 def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing() -> None:
