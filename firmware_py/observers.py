@@ -237,6 +237,8 @@ def add_to_disturbance(constants: ObserverConstants, state: ObserverState, torqu
 # --- Does a quantity swing: turns in a row and how they grow, for `safety.check_swing`; readings at rest; noise ---
 
 GROWTH = 1.05  # from one half swing to the next
+REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
+HUNTING_SWINGS = 6  # half swings in a row
 REVERSAL_SWINGS = 3  # that friction alone makes of one reversal of the reference: they do not count
 
 
@@ -258,6 +260,7 @@ def reset_swing(state: SwingState) -> None:
     _reset_one(state.torque)
     _reset_one(state.error)
     _reset_one(state.faint_error)
+    _reset_one(state.rest_error)
     state.reference_direction = 0
     state.rest_rad = 0.0
     state.rest_position_rad = 0.0
@@ -304,6 +307,21 @@ def allow_reversal(swing: Swing) -> None:
     """The reference has turned: friction does, and the torque with it."""
     swing.count = max(swing.count - REVERSAL_SWINGS, 0)
     swing.growing = max(swing.growing - REVERSAL_SWINGS, 0)
+
+
+@kernel
+def step_hunting(constants: SwingConstants, state: SwingState, error_rad: float, rests: bool, cycle: int) -> bool:
+    """Whether a joint that is to rest swings about that place, by more than its reading does at rest.
+
+    An observer pushes on against friction that sticks until that gives way; where it then falls, the joint slips past
+    the place, and sticks on its other side.
+    """
+    if not rests:
+        _reset_one(state.rest_error)
+    elif constants.hunting_rad > 0.0:
+        least_rad = max(constants.hunting_rad, REST_STEPS * state.rest_rad)
+        step_swing(state.rest_error, error_rad, least_rad, constants.hunting_cycles, cycle)
+    return state.rest_error.count >= HUNTING_SWINGS
 
 
 @kernel

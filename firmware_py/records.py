@@ -381,6 +381,8 @@ class SwingConstants:
     slowest_cycles: i8  # that half a swing may take; what is slower is a motion
     noise_Nm: f8  # mean change of the command from cycle to cycle that is worth a warning; 0 = not watched
     noise_gain: f8  # weight of a new change in that mean
+    hunting_rad: f8  # of the error of a joint that is to rest; 0 = not watched
+    hunting_cycles: i8  # that half a swing of it may take
 
 
 @record
@@ -402,6 +404,7 @@ class SwingState:
     torque: Swing
     error: Swing
     faint_error: Swing  # the same error, half as large swings counted: do they grow?
+    rest_error: Swing  # the same while the reference rests
     reference_direction: i4  # of the last desired motion that was no standstill
     rest_rad: f8  # greatest step of the position from sample to sample before the power was on
     rest_position_rad: f8

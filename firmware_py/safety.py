@@ -10,7 +10,7 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import load_acquire
-from jointctl.firmware_py.observers import allow_reversal, note_rest, step_swing, torque_noise
+from jointctl.firmware_py.observers import REST_STEPS, allow_reversal, note_rest, step_hunting, step_swing, torque_noise
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -36,7 +36,6 @@ from jointctl.firmware_py.trajectory import cubic
 TORQUE_SWINGS = 4
 ERROR_SWINGS = 6
 GROWING_SWINGS = 8
-REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
 ROUNDING_radps = 1e-9  # of a desired velocity that is the limit
 ROUNDING_rad = 1e-12  # of a desired position: a motion that ends at a limit is not beyond it
 LOOK_AHEAD_rad = 1e-5  # at most so much is allowed for the jerk of a desired motion that comes to rest at a limit
@@ -596,5 +595,9 @@ def take_notice(constants: AxisConstants, state: AxisState, torque_Nm: float) ->
         if state.notices & Notice.TORQUE_NOISE == 0:
             state.swing.noise_told_Nm = state.swing.noise_Nm
         state.notices |= Notice.TORQUE_NOISE
+    rests = state.reference.velocity_radps == 0.0 and state.reference.acceleration_radps2 == 0.0
+    error_rad = state.measured_position_rad - state.reference.position_rad
+    if step_hunting(constants.limits.swing, state.swing, error_rad, rests, state.cycle):
+        state.notices |= Notice.HUNTS
     if state.law.learning.stopped != 0:
         state.notices |= Notice.LEARNING_OFF

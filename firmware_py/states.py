@@ -113,6 +113,7 @@ class Notice(IntEnum):
     TORQUE_NOISE = 1  # the command changes too much from cycle to cycle
     LEARNING_OFF = 2  # iterative learning made the error grow and was switched off
     SANK = 4  # nothing held the joint while its torque was released
+    HUNTS = 8  # the joint swings, however slowly, about a place where it is to rest
 
 
 class FeedForward(IntEnum):

@@ -150,6 +150,17 @@ def test_learning_that_makes_the_error_grow_is_switched_off_before_the_joint_swi
         np.testing.assert_array_equal(grown, repetitions)  # who is not tripped is not touched
 
 
+@pytest.mark.trips("loop: a joint that hunts at rest", "stick_slip")
+@pytest.mark.stays("loop: a joint that hunts at rest", "lugre")
+@pytest.mark.parametrize(("friction", "hunts"), [("stick_slip", True), ("lugre", False)])
+def test_a_joint_that_hunts_at_rest_is_reported(friction: str, hunts: bool) -> None:
+    """Half a swing in 0.9 s, by 10 mrad: too slow for a limit cycle, and no harm."""
+    soft = {"kp": 300.0, "kv": 25.0, "ki": 6000.0}
+    run = carry_out("pid", 20.0, at_rest=True, control=soft, friction_kind=friction)
+    assert run.fault is Fault.NONE
+    assert run.state.notices == (Notice.HUNTS if hunts else 0)
+
+
 @pytest.mark.trips("loop: the noise of its command", "(16, True)")
 @pytest.mark.stays("loop: the noise of its command", "(17, False)")
 @pytest.mark.parametrize(("bits", "noisy"), [(16, True), (17, False)])

@@ -364,6 +364,14 @@ def notice_text(notice: Notice, state: AxisState) -> str:
             'an encoder with more counts, control.velocity_filter = "kalman", a lower control.velocity_cutoff_Hz or '
             "lower gains (kv, observer_radps) make it quieter"
         )
+    if notice is Notice.HUNTS:
+        swing = state.swing.rest_error
+        return (
+            f"the joint hunts about the place where it is to rest: {1e3 * float(swing.amplitude):.2f} mrad from peak "
+            f"to peak, half a swing in {int(swing.half_cycles)} cycles; the law pushes against friction that sticks, "
+            "until the joint slips past; a higher control.kv makes it less, a lower control.observer_radps rarer but "
+            "greater, without an observer (0) the joint stays where friction holds it"
+        )
     if notice is Notice.SANK:
         moved_rad = float(state.measured_position_rad - state.stood_rad)
         return (

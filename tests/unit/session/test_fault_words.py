@@ -123,6 +123,7 @@ def state_with(notices: int) -> Any:
     state = new(AxisState)[0]
     state.notices, state.swing.noise_told_Nm, state.law.learning.error_rad = notices, 12.04, 3.21e-5
     state.measured_position_rad, state.stood_rad = 0.487, 0.5
+    state.swing.rest_error.amplitude, state.swing.rest_error.half_cycles = 2.6e-3, 106
     return state
 
 
@@ -131,6 +132,7 @@ def state_with(notices: int) -> Any:
     [
         (Notice.TORQUE_NOISE, ("12.0 Nm", "encoder", "velocity_cutoff_Hz", "observer_radps")),
         (Notice.LEARNING_OFF, ("0.032 mrad", "control.learning.gain", "loop delay", "off")),
+        (Notice.HUNTS, ("2.60 mrad", "in 106 cycles", "control.kv", "observer_radps")),
         (Notice.SANK, ("-0.0130 rad", "torque was released", "nothing but a brake holds it", "support it")),
     ],
 )

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from jointctl.firmware_py.observers import GROWTH, REVERSAL_SWINGS, step_swing
+from jointctl.firmware_py.observers import GROWTH, REST_STEPS, REVERSAL_SWINGS, step_swing
 from jointctl.firmware_py.records import LimitConstants, Swing, SwingState
-from jointctl.firmware_py.safety import ERROR_SWINGS, GROWING_SWINGS, REST_STEPS, TORQUE_SWINGS, swing_fault, swing_Hz
+from jointctl.firmware_py.safety import ERROR_SWINGS, GROWING_SWINGS, TORQUE_SWINGS, swing_fault, swing_Hz
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 

@@ -49,7 +49,7 @@ def test_a_run_begins_without_a_swing() -> None:
     state.view(dtype="u1")[:] = 1
     reset_swing(state[0])
     for name in dtype_of(SwingState).names or ():
-        if name in ("torque", "error", "faint_error"):
+        if name in ("torque", "error", "faint_error", "rest_error"):
             assert all(state[0][name][field] == 0 for field in dtype_of(Swing).names or ())
         else:
             assert state[0][name] == 0
@@ -185,3 +185,22 @@ def test_a_run_whose_torque_swings_ends_with_the_quick_stop(
 def test_a_limit_cycle_at_the_limit_is_told_as_that_and_not_as_saturation(rig: NewRig) -> None:
     run = shaken(rig, 1000.0)
     assert_fault(run, Fault.LIMIT_CYCLE, Reaction.QUICK_STOP)
+
+
+@pytest.mark.parametrize(
+    ("size_rad", "half_cycles", "speed_radps", "hunts"),
+    [(0.002, 100, 0.0, True), (0.002, 100, 1e-3, False), (0.0009, 100, 0.0, False), (0.002, 301, 0.0, False)],
+)
+def test_an_error_that_swings_at_rest_is_noticed_however_slow(
+    axis: Any, state: Any, size_rad: float, half_cycles: int, speed_radps: float, hunts: bool
+) -> None:
+    axis.limits.swing.hunting_rad, axis.limits.swing.hunting_cycles = 0.001, 300
+    state.phase, state.reference.velocity_radps = AxisPhase.TRACKING, speed_radps
+    for half in range(8):
+        for _ in range(half_cycles):
+            state.measured_position_rad = state.reference.position_rad + (half % 2) * size_rad
+            take_notice(axis, state, 0.0)
+            state.cycle += 1
+        if half < 6:  # two halves tell where it turns
+            assert state.notices == 0
+    assert state.notices == (Notice.HUNTS if hunts else 0)
