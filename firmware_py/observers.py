@@ -239,6 +239,7 @@ def add_to_disturbance(constants: ObserverConstants, state: ObserverState, torqu
 GROWTH = 1.05  # from one half swing to the next
 REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
 HUNTING_SWINGS = 6  # half swings in a row
+HUNTING_SLOWER = 16  # times the slowest half swing of a limit cycle
 REVERSAL_SWINGS = 3  # that friction alone makes of one reversal of the reference: they do not count
 
 
@@ -320,7 +321,7 @@ def step_hunting(constants: SwingConstants, state: SwingState, error_rad: float,
         _reset_one(state.rest_error)
     elif constants.hunting_rad > 0.0:
         least_rad = max(constants.hunting_rad, REST_STEPS * state.rest_rad)
-        step_swing(state.rest_error, error_rad, least_rad, constants.hunting_cycles, cycle)
+        step_swing(state.rest_error, error_rad, least_rad, HUNTING_SLOWER * constants.slowest_cycles, cycle)
     return state.rest_error.count >= HUNTING_SWINGS
 
 

@@ -195,8 +195,7 @@ class ObserverState:
     known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
     known_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]  # friction, gravity and what is learned, of each
     speed_radps: f8  # average of the desired one
-    # the Kalman filter alone
-    primed: i4  # 0 until the first reading
+    primed: i4  # 0 until the first reading; of the Kalman filter alone, as the next two
     error_rad: f8
     error_rate_radps: f8
 
@@ -382,7 +381,6 @@ class SwingConstants:
     noise_Nm: f8  # mean change of the command from cycle to cycle that is worth a warning; 0 = not watched
     noise_gain: f8  # weight of a new change in that mean
     hunting_rad: f8  # of the error of a joint that is to rest; 0 = not watched
-    hunting_cycles: i8  # that half a swing of it may take
 
 
 @record

@@ -557,14 +557,10 @@ def check_swing(constants: AxisConstants, state: AxisState, torque_Nm: float) ->
     if state.phase < AxisPhase.APPROACH or state.phase > AxisPhase.RAMPING:
         return
     reference = state.reference
-    fault = swing_fault(
-        constants.limits,
-        state.swing,
-        torque_Nm - constants.law.inertia_kgm2 * reference.acceleration_radps2 - state.stream.torque_Nm,
-        state.measured_position_rad - reference.position_rad,
-        reference.velocity_radps,
-        state.cycle,
-    )
+    error_rad = state.measured_position_rad - reference.position_rad
+    beyond_Nm = torque_Nm - constants.law.inertia_kgm2 * reference.acceleration_radps2 - state.stream.torque_Nm
+    speed_radps, cycle = reference.velocity_radps, state.cycle
+    fault = swing_fault(constants.limits, state.swing, beyond_Nm, error_rad, speed_radps, cycle)
     if fault != Fault.NONE:
         trip(state, fault, swing_Hz(state.swing, constants.law.period_s), 0)
 

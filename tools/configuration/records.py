@@ -59,7 +59,7 @@ MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # way of the reference at a standing reading, as a share of the following error that is allowed: without friction
 # feed-forward a healthy joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
-HUNTING_COUNTS, HUNTING_rad, HUNTING_S = 4.0, 1e-4, 5.0  # peak to peak, and that half a swing of it may take
+HUNTING_COUNTS, HUNTING_rad = 4.0, 1e-4  # peak to peak
 FROZEN_FRICTION = 1.5  # times the static friction: what a healthy joint does not stand still under
 FROZEN_WAYS = 2.0  # of the tolerance, that what is beyond the friction moves a rigid joint by before it counts
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
@@ -372,7 +372,6 @@ def _fill_swing(record: SwingConstants, config: Config) -> None:
     record.noise_Nm = min(limits.torque_noise_share * limits.torque_max_Nm, NOISE_OF_RATE * rate_Nm)
     record.noise_gain = 1.0 / _cycles(config, NOISE_S)
     record.hunting_rad = max(HUNTING_COUNTS * law_resolution_rad(config), HUNTING_rad)
-    record.hunting_cycles = _cycles(config, HUNTING_S)
 
 
 def _fill_sequence(
