@@ -41,7 +41,8 @@ class LoopHandle:
     when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
-    _allowed: Mapping[int, set[int]] = {}  # where the threads of this process could run before `go`
+    _processor: int | None = None  # that the loop has for itself from `go` on
+    _allowed: Mapping[int, set[int]] = {}  # where the threads of this process could run before
     _cycle_ns = _looked_ns = _stood_ns = 0  # of `_hung_ns`
 
     def __init__(
