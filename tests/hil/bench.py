@@ -21,7 +21,6 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
-from tests.hil import preloaded
 from tests.python_process import Finished
 from tests.real_time_joint import real_time_joint
 
@@ -29,22 +28,14 @@ from tests.real_time_joint import real_time_joint
 class Started:
     """A `jointctl` process in a session of its own, its streams in files."""
 
-    def __init__(
-        self, folder: Path, arguments: tuple[str, ...], *, script: Path | None = None, anew: bool = True, **options: Any
-    ) -> None:
-        """`anew`: as a user starts it; otherwise, without streams of the test's own, by `preloaded`."""
+    def __init__(self, folder: Path, arguments: tuple[str, ...], script: Path | None = None, **options: Any) -> None:
         number = len(list(folder.glob("*.stderr")))
         self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
         what = ["-m", "jointctl.tools.verbs"] if script is None else [str(script)]
         command = [sys.executable, "-P", *what, *arguments]
-        self.process: subprocess.Popen[bytes] | preloaded.Forked
-        with self._files[0].open("wb") as out, self._files[1].open("wb") as err, open(os.devnull, "rb") as none:
-            if anew or script is not None or options.keys() - {"env"}:
-                options = {"stdin": none, "stdout": out, "stderr": err, **options}
-                self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
-            else:
-                streams = [none.fileno(), out.fileno(), err.fileno()]
-                self.process = preloaded.start(arguments, folder, streams, options.get("env", dict(os.environ)))
+        with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
+            options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
+            self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
 
     @property
     def err(self) -> str:
@@ -97,8 +88,8 @@ def processes_in(folder: Path) -> list[int]:
 class Bench:
     """A folder, a bus of its own name, and `jointctl` as a user types it there."""
 
-    def __init__(self, folder: Path, *, anew: bool = True) -> None:
-        self.folder, self._anew = folder, anew
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         self.channel = f"test-{os.getpid()}-{uuid.uuid4().hex[:8]}"
         self._started: list[Started] = []
         self._joints = contextlib.ExitStack()
@@ -126,7 +117,7 @@ class Bench:
         return folder / "arm.toml"
 
     def start(self, *arguments: str, **options: Any) -> Started:
-        self._started.append(Started(self.folder, arguments, anew=self._anew, **options))
+        self._started.append(Started(self.folder, arguments, **options))
         return self._started[-1]
 
     def run(self, *arguments: str, timeout_s: float = 180.0, **options: Any) -> Finished:

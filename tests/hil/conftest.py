@@ -14,14 +14,11 @@ from tests.hil.serial_bench import SerialBench, end_line_guards, name_kept
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_serial_joint
 
-# files whose commands start as a user starts them; so do all with a terminal, and programs
-ANEW = {"test_run_cli.py", "test_stop_and_clear.py", "test_demo.py", "test_scope_door.py"}
-
 
 @pytest.fixture
-def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
+def bench(tmp_path: Path) -> Iterator[Bench]:
     """A new folder and bus; every process started through it is ended."""
-    bench = Bench(tmp_path, anew=request.path.name in ANEW)
+    bench = Bench(tmp_path)
     yield bench
     bench.end()
 
