@@ -88,7 +88,6 @@ class LoopHandle:
 
     def __exit__(self, *_: object) -> None:
         """A loop that still runs gets the word to switch off, and is killed only if it does not listen."""
-        let_run(self._allowed)
         if self._process.poll() is None:
             self.request_stop(StopRequest.OFF)
             try:
@@ -96,6 +95,7 @@ class LoopHandle:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        let_run(self._allowed)  # not before: until then the processor is the loop's
 
     @property
     def pid(self) -> int:
