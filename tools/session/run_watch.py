@@ -460,6 +460,8 @@ class RunWatch:
                 return
             if not histograms[Histogram.ROUND_TRIP].any():
                 return  # nothing has been heard: the loop ends that itself, and tells it
+            if self.loop.block.whole.state.sample_age_cycles.any():
+                return  # the wait for a drive that is silent is no loop delay of its neighbours; the loop may end it
             self.delay_s = delay_s = self._drive.loop_delay_s(self.config, histograms)
             self._margins = beside(lambda: self.margin_text(delay_s))
         if self._margins is None or not self._margins.done():

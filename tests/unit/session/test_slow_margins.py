@@ -29,7 +29,7 @@ class Loop:
     def __init__(self) -> None:
         histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
         histograms[:, 100] = 300
-        self.block = SimpleNamespace(histograms=histograms)
+        self.block = SimpleNamespace(histograms=histograms, state=SimpleNamespace(sample_age_cycles=np.zeros(1)))
         self.block.whole = self.block
         self.cycles, self.may_enable = 300, False
 

@@ -126,13 +126,14 @@ def test_a_table_that_was_edited_meanwhile_changes_nothing(tmp_path: Path, text:
 
 # --- what the user is told ---
 class SilentLoop:
-    """300 cycles without one sample."""
+    """300 cycles, with so many samples; the drive of a neighbour has owed its answer for so many cycles."""
 
-    def __init__(self, samples: int) -> None:
+    def __init__(self, samples: int, owed_cycles: int) -> None:
         histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
         histograms[Histogram.WORK, 20] = histograms[Histogram.WAKE, 5] = 300
         histograms[Histogram.ROUND_TRIP, 100] = samples
-        self.block = SimpleNamespace(histograms=histograms)
+        state = SimpleNamespace(sample_age_cycles=np.array([0, owed_cycles]))
+        self.block = SimpleNamespace(histograms=histograms, state=state)
         self.block.whole = self.block
         self.cycles = 300
         self.may_enable = False
@@ -142,13 +143,13 @@ class SilentLoop:
 
 
 @pytest.mark.parametrize("velocity", [False, True])
-@pytest.mark.parametrize("samples", [0, 300])
+@pytest.mark.parametrize(("samples", "owed_cycles"), [(0, 300), (300, 0), (300, 4)])
 def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, samples: int, velocity: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, samples: int, owed_cycles: int, velocity: bool
 ) -> None:
     config = edited(tmp_path)
     log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
-    loop: Any = SilentLoop(samples)
+    loop: Any = SilentLoop(samples, owed_cycles)
     nothing: Any = None
     parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
     plan = resolve(config)
@@ -160,9 +161,10 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
         watch.check_delay()
         assert not loop.may_enable
         watch._may_enable()
-    assert loop.may_enable is (samples > 0)
-    assert (watch.delay_s is None) is (samples == 0)
-    if samples:
+    heard = samples > 0 and owed_cycles == 0
+    assert loop.may_enable is heard
+    assert (watch.delay_s is None) is not heard
+    if heard:
         assert watch.delay_s == pytest.approx(1e-3)
 
 
