@@ -274,8 +274,10 @@ def step_lugre(
 # Where a move has ended the bristles are near their limit, and creep on in its direction with every count of the
 # encoder and every Nm that is fed forward too much.  They have to be let go: by as much as the joint is seen to go on,
 # and of a joint that is not rigid, whose gains are too low to hold it, by half at once.  They spring back by what they
-# were let go of, which is elastic and small (`_let_go`).  Of such a joint the observer is slow as well: what it has
-# found on arrival is mostly friction of this direction.  It keeps the mean of both directions, which is a load.
+# were let go of, over their stiffness as it was found (`_let_go`).  There the joint is a spring, and for a moment an
+# integrator of that stiffness takes a rigid one back to within a count; for longer it would swing between two counts.
+# Of a joint that is not rigid the observer is slow as well: what it has found on arrival is mostly friction of this
+# direction.  It keeps the mean of both directions, which is a load.
 #
 # Bounded by construction: bristles in parallel, none of them negative, that together have at most `reach` more or less
 # than the configured friction in either direction, and sines of at most `ripple_max_Nm`.  Not modelled: friction that
@@ -288,9 +290,10 @@ SINES = 2 * BRISTLES  # the first part that is one
 MOST = 1.2  # that a kind of bristles may weigh
 LEAST_SHARE = 0.5  # of the bristles that take something over
 TAKEN_radps = 20.0  # slow: with a reducer that is not rigid, friction moves the desired motor angle as well
-LET_GO = 5.0  # by how many times the configured stiffness the bristles give way to a joint that goes on
+LET_GO = 3.0  # by how many times their stiffness the bristles give way to a joint that goes on
+BACK_radps, BACK_s, BACK_COUNTS = 30.0, 0.08, 0.8  # a rigid one goes back, for this time, from so many counts on
 TURNING_CYCLES = 4  # a motion that turns back rests for one
-MOST_LET_GO = 0.8  # of what they held when the motion came to rest
+MOST_LET_GO, MOST_HELD = 0.8, 0.95  # of what they held when the motion came to rest
 AT_ONCE, AT_ONCE_s = 0.5, 0.03  # of a joint that is not rigid, in this time
 AVERAGED_s = 1.0  # of the observer's torque in one direction
 LEAST_MOVED_s = 0.3  # in each direction, before their mean counts
@@ -387,19 +390,30 @@ def _held_Nm(law: LawConstants, state: AdaptationState) -> float:
 
 @kernel
 def _let_go(law: LawConstants, state: AdaptationState, error_rad: float) -> None:
-    """Let the bristles go where the joint goes on after the move, never more than `MOST_LET_GO` of what they held."""
+    """Let the bristles go where the joint goes on after the move, and take it back to where it should be.
+
+    They keep at least 1 - `MOST_LET_GO` of what they held when it came to rest, and get no more than `MOST_HELD` of it.
+    """
     held = _held_Nm(law, state)
     size, began = abs(held), abs(state.rest_friction_Nm)
     if held * state.rest_friction_Nm <= 0.0:
         return
+    side, stiffness = 0 if held >= 0.0 else 1, 0.0
+    for k in range(BRISTLES):
+        stiffness += STIFFNESS[k] * state.weights[2 * k + side] * law.lugre.stiffness_Nmprad
+    along_rad = math.copysign(error_rad, error_rad * held)
+    rested_s = (state.resting - TURNING_CYCLES) * law.period_s
     wanted_Nm = 0.0
-    beyond_rad = math.copysign(error_rad, error_rad * held) - state.rest_error_rad
-    if beyond_rad > 0.0:
-        state.rest_error_rad += beyond_rad
-        wanted_Nm = LET_GO * law.lugre.stiffness_Nmprad * beyond_rad
-    if law.kind == ControllerKind.FLEXIBLE_JOINT and (state.resting - TURNING_CYCLES) * law.period_s <= AT_ONCE_s:
-        wanted_Nm += AT_ONCE * began * law.period_s / AT_ONCE_s
+    if along_rad > state.rest_error_rad:
+        wanted_Nm = LET_GO * stiffness * (along_rad - state.rest_error_rad)
+        state.rest_error_rad = along_rad
+    if law.kind == ControllerKind.FLEXIBLE_JOINT:
+        if rested_s <= AT_ONCE_s:
+            wanted_Nm += AT_ONCE * began * law.period_s / AT_ONCE_s
+    elif rested_s <= BACK_s and abs(error_rad) > BACK_COUNTS * law.adaptation.count_rad:
+        wanted_Nm += BACK_radps * law.period_s * stiffness * along_rad
     left = max(size - wanted_Nm, min(size, (1.0 - MOST_LET_GO) * began))
+    left = min(left, max(size, MOST_HELD * began))
     for k in range(BRISTLES):
         state.desired_deflection_rad[k] *= left / size
         state.deflection_rad[k] = state.desired_deflection_rad[k]
@@ -423,7 +437,7 @@ def take_at_rest(
             state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
         state.rest_friction_Nm = _held_Nm(law, state)
         state.rest_error_rad = max(math.copysign(error_rad, error_rad * state.rest_friction_Nm), 0.0)
-    if (state.resting - TURNING_CYCLES) * law.period_s <= AT_ONCE_s:
+    if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
         state.resting += 1
     if state.resting <= TURNING_CYCLES:
         return 0.0
