@@ -28,10 +28,9 @@ WORK_S = 0.05
 def processor_time_s(pid: int) -> float:
     """What the process has used of all processors, its threads included; 0 where it has gone."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return time.clock_gettime(~pid << 3 | 2)  # its clock, as of clock_getcpuclockid(3): /proc need not be mounted
     except OSError:
         return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def end_text(code: int) -> str:

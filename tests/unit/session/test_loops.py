@@ -214,7 +214,15 @@ def test_its_end_is_told(end: str, words: str) -> None:
         waiting.starting.check()
 
 
-def test_the_processor_time_of_a_process_grows_with_its_work() -> None:
+@pytest.mark.parametrize("mounted", [True, False])
+def test_the_processor_time_of_a_process_grows_with_its_work(monkeypatch: pytest.MonkeyPatch, mounted: bool) -> None:
+    """With or without /proc: one that compiles for longer than IDLE_S must not seem to hang."""
+
+    def not_there(path: Path, *_: Any) -> str:
+        raise FileNotFoundError(path)
+
+    if not mounted:
+        monkeypatch.setattr(Path, "read_text", not_there)
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     give_up_s = time.monotonic() + 30.0
     while processor_time_s(process.pid) < 0.1:
