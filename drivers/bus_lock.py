@@ -39,7 +39,7 @@ from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import program_name
-from jointctl.drivers.stop_note import LOCKS, remove_old, settle, stopped, write_note
+from jointctl.drivers.stop_note import EXHAUSTED, LOCKS, remove_old, settle, stopped, write_note
 
 # --- Unix sockets between programs of one computer: a name, the process at the other end, lines of JSON ---
 
@@ -121,8 +121,12 @@ class BusLock:
         try:
             self._take_free_name()
             self._wake, self._woken = socket.socketpair()
-        except OSError:  # no such sockets here
-            self.stopped = stopped(self._name)
+        except OSError as error:
+            if self._server is not None:
+                self._server.close()
+            if error.errno in EXHAUSTED:
+                raise
+            self.stopped = stopped(self._name)  # no such sockets here
             return
         self._thread = threading.Thread(target=self._serve, name="bus lock", daemon=True)
         self._thread.start()

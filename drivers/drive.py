@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -175,11 +175,29 @@ class DriveGroup:
         return ports
 
     def make_safe(self, *, asked: bool = False) -> list[str]:
-        """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer."""
-        if len(self.drives) == 1:
-            return [self.drives[0].make_safe(asked=asked)]
-        with ThreadPoolExecutor(len(self.drives)) as pool:
-            return list(pool.map(lambda drive: drive.make_safe(asked=asked), self.drives))
+        """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer.
+
+        One after the other where no thread can be started.  An executor would take nothing at all once the main thread
+        has ended, which a program's own thread may survive.
+        """
+        states = ["unknown: switching off has failed"] * len(self.drives)
+
+        def switch_off(axis: int) -> None:
+            states[axis] = self.drives[axis].make_safe(asked=asked)
+
+        here, threads = [0], []
+        for axis in range(1, len(self.drives)):
+            thread = threading.Thread(target=switch_off, args=(axis,))
+            try:
+                thread.start()
+                threads.append(thread)
+            except RuntimeError:
+                here.append(axis)
+        for axis in here:
+            switch_off(axis)
+        for thread in threads:
+            thread.join()
+        return states
 
     def close(self) -> None:
         """Release the bus."""

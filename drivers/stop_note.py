@@ -26,6 +26,7 @@ KEPT_S = 86_400.0  # no program takes so long from its start to its bus
 MOST = 64  # that are kept of a lock
 SHARED_S = 60.0
 _LONGEST = 4096  # bytes of a note
+EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what is there may not be seen
 
 
 class _Note(NamedTuple):
@@ -124,7 +125,7 @@ def _read(path: Path) -> _Note | None:
         try:
             fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):  # it may be one
+            if error.errno in EXHAUSTED:
                 raise
             return None
         try:

@@ -11,6 +11,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -27,10 +28,9 @@ WORK_S = 0.05
 def processor_time_s(pid: int) -> float:
     """What the process has used of all processors, its threads included; 0 where it has gone."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return time.clock_gettime(~pid << 3 | 2)  # its clock, as of clock_getcpuclockid(3): /proc need not be mounted
     except OSError:
         return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def end_text(code: int) -> str:
@@ -85,6 +85,14 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def own_threads() -> set[int]:
+    """Of this process: the kernel's list may leave one out while others end, and needs /proc; Python knows its own."""
+    own = {thread.native_id for thread in threading.enumerate() if thread.native_id is not None}
+    with suppress(OSError):
+        own |= set(map(int, os.listdir("/proc/self/task")))
+    return own
+
+
 def keep_off(processor: int | None) -> dict[int, set[int]]:
     """All threads of this process, and what they start, keep off a processor where there is another.
 
@@ -93,7 +101,7 @@ def keep_off(processor: int | None) -> dict[int, set[int]]:
     before: dict[int, set[int]] = {}
     if processor is None or not hasattr(os, "sched_setaffinity"):
         return before
-    for thread in map(int, os.listdir("/proc/self/task")):
+    for thread in own_threads():
         with suppress(OSError):  # one that has ended in the meantime
             allowed = os.sched_getaffinity(thread)
             if others := allowed - {processor}:
@@ -103,10 +111,10 @@ def keep_off(processor: int | None) -> dict[int, set[int]]:
 
 
 def let_run(allowed: Mapping[int, set[int]]) -> None:
-    """Each thread on the processors that `keep_off` has found."""
-    for thread, processors_of_it in allowed.items():
+    """Each thread on the processors that `keep_off` has found; the number of one that has ended may be another's."""
+    for thread in own_threads() & allowed.keys():
         with suppress(OSError):
-            os.sched_setaffinity(thread, processors_of_it)
+            os.sched_setaffinity(thread, allowed[thread])
 
 
 @contextmanager

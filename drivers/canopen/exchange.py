@@ -97,9 +97,6 @@ def receive_frame(fd: int, frames: np.ndarray, index: int) -> int:
             return -int(code)
 
 
-HEADER_BYTES = 64
-
-
 class Batch(NamedTuple):
     """The last frame of each drive in a cycle, so that those of a bus go to the system in one call (sendmmsg(2))."""
 
@@ -120,7 +117,7 @@ def batch_of(count: int) -> Batch:
 @kernel
 def send_batch(fd: int, batch: Batch, first: int, count: int) -> int:
     """How many of these frames the bus has taken, from the first one on; why not the next one, `send_frame` tells."""
-    address = np.uintp(batch.headers.ctypes.data + first * HEADER_BYTES)
+    address = np.uintp(batch.headers.ctypes.data + first * batch.headers.strides[0])
     return max(int(sendmmsg(np.int32(fd), address, np.int32(count), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))), 0)
 
 

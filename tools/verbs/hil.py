@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
-from jointctl.tools.child_process import BUS, DRIVE
+from jointctl.tools.child_process import BUS, DRIVE, own_threads
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
@@ -159,10 +159,7 @@ def make_realtime(config: Config, output: Output) -> None:
     """Every thread of this process, once bus, drive and SDO server are compiled and run."""
     from jointctl.tools.session.loop_process import become_realtime
 
-    # the kernel's list may leave one out while others end; Python knows its own
-    ours = {thread.native_id for thread in threading.enumerate() if thread.native_id is not None}
-    all_threads = sorted(ours | {int(name) for name in os.listdir("/proc/self/task")})
-    for line in become_realtime(None, config.loop.priority, all_threads):
+    for line in become_realtime(None, config.loop.priority, sorted(own_threads())):
         output.note(f"virtual joint: {line}")
 
 

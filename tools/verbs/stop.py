@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jointctl.drivers.errors import ConfigurationError, JointctlError
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AS_CONFIGURED, BusOptions, ConfigPath, ResultOutput, config_path, place
 
@@ -27,13 +27,13 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     path = config_path(config)
     targets, unread = stop_targets(path, place(bus))
     states: list[str] = []
-    failures: list[JointctlError] = []
+    failures: list[Exception] = []
 
     def switch_off() -> None:
         failures.clear()
         try:
             states[:] = _switch_off(targets, output)
-        except JointctlError as error:
+        except Exception as error:  # whatever it is, the program that controls the drive has still to be ended
             failures.append(error)
 
     with ExitStack() as stack:

@@ -125,6 +125,24 @@ def test_where_such_sockets_are_forbidden_there_is_no_lock(channel: str, monkeyp
     BusLock("socketcan", channel).close()
 
 
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
+@pytest.mark.parametrize("what", ["socket", "socketpair"])
+def test_for_want_of_descriptors_no_one_goes_on_without_a_lock(
+    channel: str, monkeypatch: pytest.MonkeyPatch, what: str, number: int
+) -> None:
+    """`jointctl stop` would not reach it, and a second controller not be kept off."""
+
+    def exhausted(*_: object) -> None:
+        raise OSError(number, "Too many open files")
+
+    with monkeypatch.context() as scarce:
+        scarce.setattr(socket, what, exhausted)
+        with pytest.raises(OSError, match="Too many open files"):
+            BusLock("socketcan", channel)
+    assert not lock_holders("socketcan", channel)
+    BusLock("socketcan", channel).close()
+
+
 def test_no_process_that_was_started_keeps_the_lock(channel: str) -> None:
     lock = BusLock("socketcan", channel)
     command = [sys.executable, "-c", "print(flush=True); input()"]

@@ -336,7 +336,7 @@ def test_a_server_keeps_off_the_loops_processor(
     nice: list[int] = []
     chosen: list[set[int]] = []
     monkeypatch.setattr("os.nice", nice.append)
-    monkeypatch.setattr("os.listdir", lambda folder: ["7"])
+    monkeypatch.setattr("jointctl.tools.child_process.own_threads", lambda: {7})
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: allowed)
     monkeypatch.setattr("os.sched_setaffinity", lambda pid, processors: chosen.append(processors))
     stand_aside(loop_cpu)

@@ -24,7 +24,7 @@ from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.slow_start import compiling, slow_start
-from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, keep_off, processor_time_s, processors
+from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, keep_off, let_run, processor_time_s, processors
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import trajectory_table
@@ -126,6 +126,30 @@ def test_a_processor_that_is_not_chosen_or_not_there_changes_nothing() -> None:
     assert os.sched_getaffinity(0) == allowed
 
 
+@pytest.mark.skipif(processors() < 2, reason="this computer has one processor")
+def test_without_proc_it_is_the_threads_that_python_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    def not_mounted(path: str) -> list[str]:
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(os, "listdir", not_mounted)
+    allowed = os.sched_getaffinity(0)
+    before = keep_off(max(allowed))
+    assert os.sched_getaffinity(0) == allowed - {max(allowed)}
+    let_run(before)
+    assert os.sched_getaffinity(0) == allowed
+
+
+@pytest.mark.skipif(processors() < 2, reason="this computer has one processor")
+def test_a_thread_that_has_ended_gives_nothing_back_to_who_has_its_number_now() -> None:
+    allowed = os.sched_getaffinity(0)
+    with subprocess.Popen(["sleep", "60"]) as other:  # another loop, say, which is alone on its processor
+        os.sched_setaffinity(other.pid, {min(allowed)})
+        let_run({other.pid: allowed})
+        found = os.sched_getaffinity(other.pid)
+        other.kill()
+    assert found == {min(allowed)}
+
+
 # --- Waiting for a process that compiles: as long as it works, and in words when it ends or hangs ---
 class Waiting:
     """A process that sleeps behind a clock and a processor time that the test moves."""
@@ -190,7 +214,15 @@ def test_its_end_is_told(end: str, words: str) -> None:
         waiting.starting.check()
 
 
-def test_the_processor_time_of_a_process_grows_with_its_work() -> None:
+@pytest.mark.parametrize("mounted", [True, False])
+def test_the_processor_time_of_a_process_grows_with_its_work(monkeypatch: pytest.MonkeyPatch, mounted: bool) -> None:
+    """With or without /proc: one that compiles for longer than IDLE_S must not seem to hang."""
+
+    def not_there(path: Path, *_: Any) -> str:
+        raise FileNotFoundError(path)
+
+    if not mounted:
+        monkeypatch.setattr(Path, "read_text", not_there)
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     give_up_s = time.monotonic() + 30.0
     while processor_time_s(process.pid) < 0.1:

@@ -107,3 +107,16 @@ def test_margins_that_are_refused_end_the_run(tmp_path: Path, slow: Slow) -> Non
         look(watch)
     assert not loop.may_enable
     assert not said
+
+
+def test_a_wait_for_a_drive_that_is_silent_is_no_loop_delay_of_its_neighbours(tmp_path: Path, slow: Slow) -> None:
+    """The loop waits for it to the end of each slot, and ends the run if it stays away."""
+    loop, said = Loop(), list[str]()
+    age_cycles = loop.block.state.sample_age_cycles = np.array([0, 3])
+    watch = watch_of(tmp_path, loop, said)
+    look(watch)
+    assert watch.delay_s is None
+    age_cycles[:] = 0
+    look(watch)
+    assert watch.delay_s is not None
+    slow.released.set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from jointctl.tools.verbs import bench_drive
 from jointctl.tools.virtual_joint import new_devices
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS
+from tests.python_process import run_python
 
 NODES = (1, 2, 3)
 HEARTBEAT = 0x700 + 126
@@ -187,6 +189,56 @@ def test_a_drive_that_does_not_answer_keeps_no_other_one_from_being_switched_off
     said = common_state(("a", "b", "c"), states)
     assert said.startswith(f"{'abc'[deaf]}: unknown")
     assert not is_safe(said)
+
+
+@pytest.mark.parametrize("room", [0, 1, 2])
+def test_each_drive_is_switched_off_where_no_more_threads_can_be_started(
+    arm: Arm, room: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm.group.commission()
+    for axis in range(3):
+        arm.power_up(axis)
+    start, left = threading.Thread.start, iter(range(room))
+
+    def start_if_allowed(thread: threading.Thread) -> None:
+        if next(left, None) is None:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    with monkeypatch.context() as scarce:
+        scarce.setattr(threading.Thread, "start", start_if_allowed)
+        states = arm.group.make_safe()
+    assert [is_safe(state) for state in states] == [True] * 3
+    assert not any(int(arm.device(axis).state) == PowerState.OPERATION_ENABLED for axis in range(3))
+
+
+GROUP = """
+import threading
+from jointctl.drivers.drive import DriveGroup
+
+all_of_them = threading.Barrier(3)
+
+class Waiting:
+    def make_safe(self, asked):
+        all_of_them.wait(20.0)
+        return "off"
+
+def session():
+    threading.main_thread().join({wait_s})
+    print(DriveGroup([Waiting()] * 3).make_safe())
+
+thread = threading.Thread(target=session)
+thread.start()
+thread.join({ends_s})
+"""
+
+
+@pytest.mark.parametrize(("wait_s", "ends_s"), [(0.0, None), (None, 0.0)])
+def test_drives_are_switched_off_at_the_same_time_also_when_the_main_thread_has_ended(
+    wait_s: float | None, ends_s: float | None
+) -> None:
+    """A program may have its arm in a thread of its own, which ends when it likes."""
+    assert run_python(GROUP.format(wait_s=wait_s, ends_s=ends_s)) == "['off', 'off', 'off']\n"
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import can
 import pytest
 
+from jointctl.drivers import bus_lock
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia import NmtCommand, State
 from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
@@ -249,6 +250,29 @@ def test_a_stop_that_is_not_confirmed_is_an_error(joint: Any, monkeypatch: pytes
     with pytest.raises(DeviceError, match="use the emergency stop"):
         stop_module.stop(CONFIGS / "virtual.toml", Output())
     assert "operation enabled" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_whatever_goes_wrong_with_the_drive_its_program_is_ended(monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
+    """No thread could be started, say, as long as that program had them all."""
+    tries, calls = [RuntimeError("can't start new thread")], []
+
+    def switch_off(*_: Any) -> str:
+        if tries:
+            raise tries[0]
+        return "switch on disabled"
+
+    def end_programs(of: Any, note: Any, ended: Callable[[], None]) -> None:
+        calls.extend(of)
+        if again:
+            tries.clear()
+        ended()
+
+    monkeypatch.setattr(canopen_bench.CanTarget, "switch_off", switch_off)
+    monkeypatch.setattr(bus_lock, "end_programs", end_programs)
+    with nullcontext() if again else pytest.raises(RuntimeError, match="new thread"):
+        assert stop_module.stop(CONFIGS / "virtual.toml", Output(quiet=True)) == 0
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize(("state", "error"), [("operation enabled", DeviceError), ("switch on disabled", DataError)])
