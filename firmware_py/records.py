@@ -145,7 +145,6 @@ class AdaptationState:
 
 # --- The control law: network, observer, learning, and the law that holds them ---
 
-
 NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
