@@ -19,6 +19,7 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepArm
 from jointctl.tools.session.plan import resolve_arm
+from jointctl.tools.verbs.demo import demo
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.arms import long_arm
 from tests.sessions import output
@@ -194,6 +195,13 @@ def test_it_overwrites_nothing_and_its_options_go_together(tmp_path: Path) -> No
         new(tmp_path / "x.toml", out, urdf=urdf)
     with pytest.raises(UsageError, match="--urdf"):
         new(tmp_path / "x", out, arm=True, joints="j1")
+    with pytest.raises(UsageError, match=r"--from \(=csp\) is for a joint's file"):
+        new(tmp_path / "x", out, arm=True, shipped="csp")
+    with pytest.raises(UsageError, match=r"--from \(=arm\) is an arm"):
+        new(tmp_path / "x.toml", out, shipped="arm")
+    assert not (tmp_path / "x.toml").exists()
+    with pytest.raises(UsageError, match=r"--config \(=csp\) is for one joint"):
+        demo(Path("csp"), arm=True, output=out)
     with pytest.raises(UsageError, match="no drive"):
         new(tmp_path / "x", out, arm=True, urdf=urdf, drive=DriveOptions(node=1))
     with pytest.raises(UsageError, match="no terminal"):
