@@ -148,7 +148,8 @@ def report_run(result: RunResult, output: Output, config: Config | ArmConfig) ->
         return MotionFault.exit_code
     require_off(result.drive_state)
     if result.stopped_by:
-        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
+        whose = "the joints are" if result.others else "the joint is"
+        output.note(f"stopped by {result.stopped_by}; {whose} {result.drive_state}")
         return INTERRUPTED
     return 0
 

@@ -118,6 +118,16 @@ def test_limits_that_are_not_like_the_templates(tmp_path: Path, limit: str) -> N
     joint_loops(arm)
 
 
+@pytest.mark.parametrize(("speed", "effort", "key"), [(50, 60, "stop_timeout_s"), (2, 20000, "rated_current_A")])
+def test_limits_that_make_no_file_say_where_they_come_from(
+    tmp_path: Path, speed: float, effort: float, key: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=key) as caught:
+        made(tmp_path, robot(joint(1, f'<limit lower="-1" upper="1" velocity="{speed}" effort="{effort}"/>'), (9.0,)))
+    assert caught.value.hint.startswith("nothing was written: it is made of the limits in own robot.urdf")
+    assert not (tmp_path / "arm").exists()
+
+
 def test_joints_that_are_not_named_stand_at_0(tmp_path: Path) -> None:
     arm = load_arm(made(tmp_path, GOOD, joints="j1"))
     assert arm.names == ("j1",)

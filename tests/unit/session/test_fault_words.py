@@ -340,6 +340,14 @@ def result(folder: Path, fault: Fault) -> RunResult:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("joints", "words"), [(1, "the joint is off"), (2, "the joints are off")])
+def test_what_was_stopped_is_off(tmp_path: Path, joints: int, words: str) -> None:
+    one = replace(result(tmp_path, Fault.NONE), stopped_by="SIGINT")
+    found, err = replace(one, others=(one,) * (joints - 1)), io.StringIO()
+    assert run_report.report_run(found, Output(stdout=io.StringIO(), stderr=err), WITHOUT_PICTURE) == 130
+    assert err.getvalue() == f"stopped by SIGINT; {words}\n"
+
+
 @pytest.mark.parametrize(("fault", "code"), [(Fault.BUS_ERROR, 7), (Fault.NONE, 0)])
 def test_the_cause_is_told_before_the_picture_is_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Fault, code: int
