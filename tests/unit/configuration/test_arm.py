@@ -194,6 +194,12 @@ IN_URDF: list[tuple[str, str, str]] = [
     ),
     (r'xyz="0.05 0 0"', 'xyz="5 0 0"', "link hand: the centre of its mass is 5 m from its frame"),
     (r"<inertial>", "<inertial/><inertial>", "link upper_arm has 2 elements inertial"),
+    (
+        r'xyz="0.30 0 0"',
+        'xyz="0.30 0 0" quat_xyzw="0.6 0 0 0.8"',  # of URDF 1.2
+        "joint wrist: <origin> has quat_xyzw, must have xyz and rpy alone",
+    ),
+    (r'<origin xyz="0.05 0 0"/>', '<origin xzy="0.05 0 0"/>', "link hand: inertial: <origin> has xzy, must have xyz"),
     (r'<axis xyz="0 1 0"/>', "<axis/>", "joint shoulder: <axis> has no xyz"),
     (r'<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', "joint shoulder: axis (='0 1') must be 3 numbers"),
     (r'name="wrist" type="revolute"', 'name="wrist" type="floating"', "joint wrist: type (=floating) must be one of"),
