@@ -153,7 +153,7 @@ def tune(
 ) -> dict[str, Any] | None: ...
 def demo(
     *,
-    config: str | Path = "virtual",
+    config: str | Path | None = None,
     arm: bool = False,
     duration_s: float | None = None,
     quiet: bool = False,
@@ -303,7 +303,7 @@ def zero(
 def new(
     path: str | Path,
     *,
-    shipped: str = "elmo_gold_can",
+    shipped: str | None = None,
     interface: str | None = None,
     channel: str | None = None,
     bitrate: int | None = None,

@@ -325,7 +325,7 @@ class SimulatedLoop(LoopHandle):
     world: World
 
     def __init__(
-        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fds: Sequence[int] = (),
+        self, config: Config, table: Any, port: type, tail_paths: Sequence[Path] = (), marker_fds: Sequence[int] = (),
         arm: ArmModel | None = None, joints: Sequence[Config] = (),
     ) -> None:  # fmt: skip
         self.block = loop_memory.new_block(table, port, arm)

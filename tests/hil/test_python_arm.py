@@ -133,6 +133,7 @@ def test_the_death_of_the_interpreter_ramps_all_down(arm: ArmBench) -> None:
         assert time.monotonic() < give_up_s
         time.sleep(0.1)
     time.sleep(1.0)
+    assert {path.name.split(".", 1)[1] for path in tails} == {f"{name}.tail.mcap" for name in NAMES}
     for path in tails:
         records = read_run_log(path).records
         assert (records.fault[-1], records.phase[-1]) == (Fault.SUPERVISOR_LOST, AxisPhase.FINISHED)

@@ -26,7 +26,7 @@ from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_
 from jointctl.tools.configuration.load import config_of, read_document, with_units
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.configuration.sections import Duration, Rule, Section, Trajectory, between, is_number
-from jointctl.tools.configuration.urdf import Body, LARGEST_LENGTH_m, Urdf, bodies_of, of_body, read_urdf
+from jointctl.tools.configuration.urdf import Body, LARGEST_LENGTH_m, Urdf, UrdfJoint, bodies_of, of_body, read_urdf
 
 # --- [motion] of an arm file: one motion for all joints, turned into a [trajectory] for each of them ---
 
@@ -270,8 +270,9 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     urdf = read_urdf(path.parent / arm.urdf)
     names, remarks = _names(path, arm, urdf)
     bodies, inertias = _bodies(path, arm, urdf, names, alone)
+    raise_if([f"{path}: {line}" for line in (*bus_problems(arm, alone), *_limit_problems(arm, alone, bodies))])
     joints = _moved(path, file.motion, alone, names)
-    raise_if([f"{path}: {line}" for line in (*bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
+    remarks += _files_of_others(arm, names)
     odd = (*urdf.remarks, *_odd_limits(bodies), *_odd_effort(bodies))
     remarks += [f"{urdf.path.name}: {line}" for line in odd]
     for config, body in zip(joints, bodies, strict=True):
@@ -305,14 +306,31 @@ def _names(path: Path, arm: ArmSection, urdf: Urdf) -> tuple[tuple[str, ...], li
         key = "arm.joint_names" if arm.joint_names is not None else f"{urdf.path.name}: joints that move"
         wrong.append(f"{key} (={len(names)}: {', '.join(names)}) must be as many as arm.joints (={len(arm.joints)})")
     raise_if([f"{path}: {line}" for line in wrong])
-    standing = [f"joint {name} of {urdf.path.name} is not the arm's: it stands at 0" for name in moving
-                if name not in names]  # fmt: skip
+    standing = [
+        f"joint {joint.name} of {urdf.path.name} is not the arm's: it stands at 0{_unless_it_can(joint)}"
+        for joint in urdf.moving
+        if joint.name not in names
+    ]
     standing += [
         f"joint {joint.name} of {urdf.path.name} mimics {joint.mimics}: for the model it stands at 0"
         for joint in urdf.joints
         if joint.mimics is not None
     ]
     return names, standing
+
+
+def _unless_it_can(joint: UrdfJoint) -> str:
+    low, high = joint.lower_rad, joint.upper_rad
+    within = low is None or high is None or low <= 0.0 <= high
+    return "" if within else f", where its limits [{low:g}..{high:g}] let it never be: the model is of another arm"
+
+
+def _files_of_others(arm: ArmSection, names: tuple[str, ...]) -> Iterator[str]:
+    """A file of equal limits that stands in another joint's place fits, and gets that joint's torque."""
+    for file, name in zip(arm.joints, names, strict=True):
+        named = Path(file).stem
+        if named != name and named in names:
+            yield f"arm.joints: {file} stands in the place of joint {name}; is it that of joint {named}?"
 
 
 def _bodies(
@@ -333,7 +351,9 @@ def _bodies(
             wrong.append(f"arm.motor_inertia_kgm2 must be given: {', '.join(without)} has no [reducer] to take it from")
         inertias = tuple(0.0 if c.reducer is None else c.reducer.motor_inertia_kgm2 for c in joints)
     elif len(inertias) != len(joints) or min(inertias) < 0.0:
-        wrong.append(f"arm.motor_inertia_kgm2 (={list(inertias)}) must be {len(joints)} inertias, one a joint")
+        wrong.append(
+            f"arm.motor_inertia_kgm2 (={list(inertias)}) must be {len(joints)} inertias of at least 0, one a joint"
+        )
     else:
         wrong += [
             f"arm.motor_inertia_kgm2 (={inertia:g}) of {config.path.name} must be its reducer.motor_inertia_kgm2 "

@@ -329,12 +329,16 @@ _RULES = {
     "bool_type": "must be true or false",
     "finite_number": "must be finite",
     "string_too_short": "must not be empty",
+    "list_type": "must be a list",
 }
 
 
 def _rule(error: ErrorDetails) -> str:
     if error["type"] == "literal_error":
         return f"must be one of {error['ctx']['expected']}"
+    if error["type"] in ("too_short", "too_long"):  # a list
+        few, limits = error["type"] == "too_short", error["ctx"]
+        return f"must be a list of {'at least' if few else 'at most'} {limits['min_length' if few else 'max_length']}"
     message = str(error["msg"])
     return message[0].lower() + message[1:]
 

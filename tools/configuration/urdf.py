@@ -218,6 +218,8 @@ class _Reader:
 
     def _origin(self, element: ElementTree.Element, what: str) -> Pose:
         origin = self._one(element, "origin", what)
+        for key in sorted(set() if origin is None else origin.attrib.keys() - {"xyz", "rpy"}):  # such as a quaternion
+            self._problem(f"{what}: <origin> has {key}, must have xyz and rpy alone")
         zeros = (0.0, 0.0, 0.0)
         offset = self._numbers(origin, "xyz", f"{what}: xyz", zeros, LARGEST_LENGTH_m, "millimetres instead of m")
         degrees = "degrees instead of rad"

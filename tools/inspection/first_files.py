@@ -542,6 +542,9 @@ def first_arm(
             remarks += draft.loaded(trial).remarks
         except ConfigurationError as error:
             error.message = error.message.replace(f"{trial}", f"{folder}")
+            error.hint = (
+                error.hint or f"nothing was written: it is made of the limits in {urdf.path.name} and the answers"
+            )
             raise
     return draft.files(), remarks
 

@@ -547,17 +547,19 @@ def deadlines_of(summary: RunSummary, missing: int | None) -> Figures:
     return rows
 
 
-def figure_tables(names: Sequence[str], logs: Sequence[RunLog], summaries: Sequence[RunSummary]) -> list[Table]:
-    """Motion and deadlines of each run; of two runs also the second less the first."""
+def figure_tables(
+    names: Sequence[str], logs: Sequence[RunLog], summaries: Sequence[RunSummary], *, of_one_arm: bool = False
+) -> list[Table]:
+    """Motion and deadlines of each run; of two runs, but not of two joints, also the second less the first."""
     faults = [s.fault for s in summaries]
     ended = "" if all(fault == Fault.NONE.name for fault in faults) else f"Ended by a fault: {', '.join(faults)}."
     deadlines = [deadlines_of(s, missing_in(log)) for s, log in zip(summaries, logs, strict=True)]
     motion = [motion_of(s) for s in summaries]
-    return [_side_by_side("motion", names, motion, ended), _side_by_side("deadlines", names, deadlines, "")]
+    two = len(names) == 2 and not of_one_arm
+    return [_side_by_side("motion", names, motion, ended, two), _side_by_side("deadlines", names, deadlines, "", two)]
 
 
-def _side_by_side(title: str, names: Sequence[str], listed: Sequence[Figures], caption: str) -> Table:
-    two = len(listed) == 2
+def _side_by_side(title: str, names: Sequence[str], listed: Sequence[Figures], caption: str, two: bool) -> Table:
     rows: list[list[object]] = []
     for row in zip(*listed, strict=True):
         name, digits = row[0][0], row[0][2]

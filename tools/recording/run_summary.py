@@ -205,7 +205,7 @@ def summary_table(summary: RunSummary) -> Table:
     for name, error in (("tracking error", summary.error), ("tracking error, late part", summary.late_error)):
         if error is not None:
             low, high = error.range_rad.least * 1e3, error.range_rad.greatest * 1e3
-            span = f"{error.from_s:.1f}..{error.to_s:.1f} s"
+            span = f"{error.from_s:z.1f}..{error.to_s:z.1f} s"
             table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
     table.add_row("within 1 mrad for good", _settled_text(summary))
     for name, key in TORQUES.items():

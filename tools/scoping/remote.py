@@ -215,7 +215,7 @@ def remote(
     sources = SetPointSources(owner) if allow else None
     first, names = (config, JOINT_NAMES) if isinstance(config, Config) else (config.joints[0], config.names)
     order = RemoteOrder(
-        f"{config.path.stem}: {motion}" if motion else run_title(config), joint_name(config.path), names,
+        run_title(config, motion), joint_name(config.path), names,
         first.drive.kind, "", allow_remote=allow,
         only_states=only_states, loop_cpu=first.loop.cpu,
     )  # fmt: skip

@@ -37,8 +37,8 @@ RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 class LoopHandle:
     """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
-    `port`: record of the drive's exchange.  `tail_path`: where the loop itself saves the ring if this process has gone
-    when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
+    `port`: record of the drive's exchange.  `tail_paths`: where the loop itself saves the ring of each axis if this
+    process has gone when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
     _processor: int | None = None  # that the loop has for itself from `go` on
@@ -46,7 +46,7 @@ class LoopHandle:
     _cycle_ns = _looked_ns = _stood_ns = 0  # of `_hung_ns`
 
     def __init__(
-        self, config: Config, table: np.ndarray, port: type, tail_path: Path | None = None,
+        self, config: Config, table: np.ndarray, port: type, tail_paths: Sequence[Path] = (),
         marker_fds: Sequence[int] = (), arm: ArmModel | None = None, joints: Sequence[Config] = (),
     ) -> None:  # fmt: skip
         """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model and its `joints`, `config` the first."""
@@ -70,7 +70,7 @@ class LoopHandle:
             bitrate_bitps=config.bus.bitrate_bitps,
             cpu=config.loop.cpu,
             priority=config.loop.priority,
-            tail_path=None if tail_path is None else str(tail_path.absolute()),
+            tail_paths=tuple(str(path.absolute()) for path in tail_paths),
             more_buses=tuple(
                 (axis, joints[axis].bus.interface, joints[axis].bus.channel)
                 for axis in sorted(set(first_on_bus(joints)) - {0})

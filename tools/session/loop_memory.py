@@ -179,7 +179,7 @@ class LoopOrder:
     cpu: int | None
     priority: int | None
     bitrate_bitps: int | None = None  # for interfaces that set it when they are opened
-    tail_path: str | None = None  # where the ring is saved if the supervisor has gone
+    tail_paths: tuple[str, ...] = ()  # of each axis: where its ring is saved if the supervisor has gone
     axes: int = 1
     links: int = 0  # of an arm whose model is in the block
     more_buses: tuple[tuple[int, str, str], ...] = ()  # of an arm: axis of the first drive on it, interface, channel

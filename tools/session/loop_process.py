@@ -82,23 +82,19 @@ def run(order: LoopOrder) -> int:
                 time.sleep(_POLL_S)
             ready.go()
             block.words[Word.ENDED] = 1
-    if order.tail_path is not None and os.getppid() != order.supervisor_pid:
-        save_tail(block, Path(order.tail_path))
+    if os.getppid() != order.supervisor_pid:
+        save_tails(block, [Path(path) for path in order.tail_paths])
     return 0
 
 
-def save_tail(block: SharedBlock, path: Path) -> None:
-    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds.
-
-    Of an arm each joint has a file, as its log has: the second one is NAME.2.tail.mcap.
-    """
+def save_tails(block: SharedBlock, paths: Sequence[Path]) -> None:
+    """Write what the ring holds of each axis: all are off by now, and nobody else is left to keep the last seconds."""
     from jointctl.tools.recording.run_log import ERROR, RunLogWriter
 
-    for axis in range(block.axes):
+    for axis, path in enumerate(paths):
         records, lost = block.of_axis(axis).new_records(0, int(block.words[Word.HEAD]))
-        own = path if axis == 0 else path.with_name(path.name.replace(".tail.", f".{axis + 1}.tail."))
         metadata = {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}
-        with RunLogWriter(own, metadata) as log:
+        with RunLogWriter(path, metadata) as log:
             log.write_records(records)
             log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
 

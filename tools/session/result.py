@@ -101,23 +101,23 @@ class RunResult:
 # --- What a run says at its end: a fault in words, then the picture beside the log, and the table on stdout ---
 
 
-def run_title(config: Config | ArmConfig) -> str:
-    """What a run is called on its displays and its picture."""
-    return f"{config.path.stem}: {_first(config).trajectory.kind}"
+def run_title(config: Config | ArmConfig, motion: str = "") -> str:
+    """What a run is called on its displays and its picture; `motion` where it is not the configured trajectory."""
+    return f"{config.path.stem}: {motion or _first(config).trajectory.kind}"
 
 
 def _first(config: Config | ArmConfig) -> Config:
     return config if isinstance(config, Config) else config.joints[0]
 
 
-def report_run(result: RunResult, output: Output, config: Config | ArmConfig) -> int:
+def report_run(result: RunResult, output: Output, config: Config | ArmConfig, motion: str = "") -> int:
     """Print and save everything, and a picture of each joint unless log.picture forbids it; returns the exit code.
 
     That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all else, and
     what people read before the picture, which takes a second or more.  `DeviceError` where the drive did not confirm
     that it is off; both outweigh the `DataError` of a result that cannot be written.
     """
-    joints, title = result.joints, run_title(config)
+    joints, title = result.joints, run_title(config, motion)
     faulty = [joint for joint in joints if joint.fault_text is not None]
     for joint in faulty:
         text = joint.fault_text
@@ -148,7 +148,8 @@ def report_run(result: RunResult, output: Output, config: Config | ArmConfig) ->
         return MotionFault.exit_code
     require_off(result.drive_state)
     if result.stopped_by:
-        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
+        whose = "the joints are" if result.others else "the joint is"
+        output.note(f"stopped by {result.stopped_by}; {whose} {result.drive_state}")
         return INTERRUPTED
     return 0
 

@@ -10,7 +10,6 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -95,10 +94,9 @@ class Session:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
         config, signals = self._config, self.signals
         self._kind.check_rate(config)
-        tail_path = self.plan.log_path.with_suffix(".tail.mcap")
         with (
             signals.held(),
-            self._loop(tail_path) as loop,
+            self._loop() as loop,
             self._bus_there(loop),
             self._buses() as looking_on,
             self._kind.kept_awake(self._output),
@@ -137,11 +135,12 @@ class Session:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
 
-    def _loop(self, tail_path: Path) -> LoopHandle:
+    def _loop(self) -> LoopHandle:
         """The loop process, started; it waits for its word."""
         plan, port, marker_fds = self.plan, loop_of(self._config.drive.kind)[0], self._control.marker_fds
         model = None if plan.arm is None else plan.arm.config.model
-        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fds, model, plan.configs)
+        tails = [joint.log_path.with_suffix(".tail.mcap") for joint in self._joints]
+        return LoopHandle(self._config, plan.tables, port, tails, marker_fds, model, plan.configs)
 
     @contextlib.contextmanager
     def _bus_there(self, loop: LoopHandle) -> Iterator[None]:

@@ -13,13 +13,13 @@ import re
 import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
@@ -245,16 +245,18 @@ def readable_keys(
     return ReadableKeys(path, {name: found for name, found in data.items() if isinstance(found, dict)}, given, environ)
 
 
-def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[list[StopTarget], list[ConfigurationError]]:
-    """`stop_target` of a joint's file, or of each joint that an arm's file names; beside them what cannot be read.
+def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[dict[str, StopTarget], list[JointctlError]]:
+    """`stop_target` of a joint's file, or of each joint that an arm's file names, by name; beside them what is wrong.
 
-    A joint of an arm that cannot be read must not cost the stop of the others.
+    A joint of an arm that cannot be read must not cost the stop of the others, nor must a node, which is one joint's.
     """
     joints = readable_keys(path).section("arm").get("joints")
     if not isinstance(joints, list) or not joints:
-        return [stop_target(path, given)], []
-    targets: list[StopTarget] = []
-    problems: list[ConfigurationError] = []
+        return {path.name: stop_target(path, given)}, []
+    targets: dict[str, StopTarget] = {}
+    problems: list[JointctlError] = []
+    of_one = None if given is None else given.node
+    given = None if given is None else replace(given, node=None)
     buses: dict[tuple[str, str], int] = {}
     for name in joints:
         file, its_given = path.parent / str(name), given
@@ -263,11 +265,14 @@ def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[list[Stop
             place = str(section.get("interface")), str(section.get("channel"))
             its_given = given.of_bus(buses.setdefault(place, len(buses)))
         try:
-            targets.append(stop_target(file, its_given))
+            targets[str(name)] = stop_target(file, its_given)
         except ConfigurationError as error:
             problems.append(error)
     if not targets:
         raise problems[0]
+    if of_one is not None:
+        what = f"--target (={of_one}) is one joint's, and {path} is an arm, stopped at the nodes of its files"
+        problems.append(UsageError(what, "give the joint's file"))
     return targets, problems
 
 

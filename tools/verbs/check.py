@@ -151,10 +151,14 @@ def check_cascade(
 def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False) -> int:
     """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
     from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
+    from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import require_loop
+    from jointctl.tools.session.canopen_drive import require_buses
     from jointctl.tools.session.plan import blamed, resolve_arm
 
+    require_buses(arm.joints)
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
+    warnings = [f"{config.path}: {line}" for config in arm.joints for line in contradictions(config)]
     table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
     for budget in budgets:
         note = (
@@ -172,7 +176,7 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
         margin = f"{found.phase_margin_deg:.1f} deg" if found.stable else "UNSTABLE"
         table.add_row("  phase margin", margin, f"worst case: {found.joint}; {minimum_deg:g} deg wanted")
         if not (1.0 - _INERTIA_SLACK) * poses.least_kgm2 <= own <= (1.0 + _INERTIA_SLACK) * poses.greatest_kgm2:
-            output.warning(
+            warnings.append(
                 f"{loop.config.path}: joint.inertia_kgm2 (={own:g}) should be in "
                 f"[{poses.least_kgm2:.3g}..{poses.greatest_kgm2:.3g}], what the arm's poses give"
             )
@@ -183,8 +187,11 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
              "phase_margin_deg": loop.margins.phase_margin_deg, "worst_case": loop.margins.joint}
             for loop in loops
         ],
+        "warnings": [*arm.remarks, *warnings],
     }  # fmt: skip
     output.result(table, data)
+    for text in warnings:
+        output.warning(text)
     for loop in loops:
         with blamed(f"joint {loop.name}"):
             require_loop(loop.config, loop.settings, loop.margins, allow_low_margin=allow_low_margin)

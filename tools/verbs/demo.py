@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
@@ -22,8 +22,11 @@ PATIENCE_S = 0.15  # a shared computer may stand still for so long; here only si
 
 def demo(
     config: Annotated[
-        Path, typer.Option("--config", help="configuration with a virtual joint", autocompletion=configurations)
-    ] = Path("virtual"),
+        Path | None,
+        typer.Option(
+            "--config", help="configuration with a virtual joint", show_default="virtual", autocompletion=configurations
+        ),
+    ] = None,
     *,
     arm: Annotated[bool, typer.Option("--arm", help="the shipped arm of three joints instead of one joint")] = False,
     duration_s: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
@@ -31,13 +34,15 @@ def demo(
 ) -> int:
     """Track a trajectory on the virtual joint, or with a virtual arm: no hardware, no set-up."""
     if arm:
+        if config is not None:
+            raise UsageError(f"--config (={config}) is for one joint: --arm is the shipped arm")
         return _demo_of_arm(duration_s, output)
     from jointctl.tools.child_process import own_virtual_joint
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
     from jointctl.tools.verbs.run import tracked
 
-    path = config_path(config)
+    path = config_path(config or Path("virtual"))
     joint = load_config(path)
     require_simulated(joint, "demo")
     if joint.virtual is None:

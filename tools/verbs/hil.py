@@ -65,6 +65,8 @@ def hil(
     if not isinstance(joint, Config):
         if model.eds is not None:
             raise UsageError(f"--eds (={model.eds}) is for a single joint, and {joint.path} is an arm")
+        if serial or link is not None:
+            raise UsageError(f"--serial and --link are for a single joint, and {joint.path} is an arm on CAN")
         return bench_of(joint.joints[0]).serve_arm(joint, output, options)
     if model.eds is not None:
         joint = with_eds(joint, model.eds)

@@ -44,9 +44,14 @@ def new(
     output: ProgressOutput,
     *,
     shipped: Annotated[
-        str,
-        typer.Option("--from", help="name of the shipped configuration", autocompletion=shipped_configurations),
-    ] = "elmo_gold_can",
+        str | None,
+        typer.Option(
+            "--from",
+            help="name of the shipped configuration",
+            show_default="elmo_gold_can",
+            autocompletion=shipped_configurations,
+        ),
+    ] = None,
     drive: DriveOptions = NOBODY,
     no_input: Annotated[bool, typer.Option("--no-input", help="ask nothing; what is open stays marked")] = False,
     arm: Annotated[bool, typer.Option("--arm", help="a folder with an arm file, its URDF, its joints' files")] = False,
@@ -62,6 +67,10 @@ def new(
     if arm:
         if drive != NOBODY:
             raise UsageError("--arm asks no drive: -i, -c, -b and --node are for a joint's file")
+        if shipped is not None:
+            raise UsageError(
+                f"--from (={shipped}) is for a joint's file: an arm is made of the shipped one or of --urdf"
+            )
         if urdf is None and joints:
             raise UsageError("--joints names joints of a URDF: give --urdf as well")
         return _new_arm(path, output) if urdf is None else _arm_of_urdf(path, urdf, joints, output, ask=not no_input)
@@ -70,8 +79,12 @@ def new(
     from jointctl.tools.configuration.load import read_text, shipped_config
     from jointctl.tools.inspection.first_files import filled
 
-    source = shipped_config(shipped)
+    source = shipped_config(shipped or "elmo_gold_can")
     text = read_text(source)
+    if "[arm]" in text.splitlines():
+        raise UsageError(
+            f"--from (={shipped}) is an arm, which is several files", "give --arm and the name of a folder"
+        )
     if path.suffix != ".toml":
         raise DataError(f"{path}: the name of a configuration must end in .toml")
     if path.exists():

@@ -85,13 +85,14 @@ def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Sectio
         Paragraph(verdict(name, s), "" if s.fault == Fault.NONE.name else "error")
         for name, s in zip(names, summaries, strict=True)
     ]
+    joints = bool(of_one_arm(logs))
     sections = [
         Section("What ran", [*verdicts, what_ran(names, logs)]),
-        Section("In numbers", figure_tables(names, logs, summaries)),
+        Section("In numbers", figure_tables(names, logs, summaries, of_one_arm=joints)),
     ]
     if len(logs) > 1:
         records = [log.records for log in logs]
-        blocks = together(names, records) if of_one_arm(logs) else comparison(names, records)
+        blocks = together(names, records) if joints else comparison(names, records)
         sections.append(Section("Side by side", blocks))
     for name, log in zip(names, logs, strict=True):
         title = "Figures" if len(logs) == 1 else f"Figures of {name}"

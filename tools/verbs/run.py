@@ -71,11 +71,12 @@ def tracked(
 
     if not (assume_yes or dry_run):
         require_terminal()
+    motion = "hold" if live.hold else ""
     plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
-        _displays(plan, output, run_title(config), scope) as display,
-        remote(live, config, output) as others,
+        _displays(plan, output, run_title(config, motion), scope) as display,
+        remote(live, config, output, motion=motion) as others,
         in_control(plan.config, output, plan.configs[1:]) as control,
     ):
         session = Session(
@@ -88,7 +89,7 @@ def tracked(
             return broken_off(session.drive_state, output, control.signals.by_command)
     if result is None:
         return never_begun(session.drive_state, output, dry_run=dry_run)
-    return report_run(result, output, config)
+    return report_run(result, output, config, motion)
 
 
 @contextmanager

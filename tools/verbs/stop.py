@@ -21,7 +21,7 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
     from jointctl.drivers.bus_lock import StopCall, end_programs
-    from jointctl.drivers.drive import common_state
+    from jointctl.drivers.drive import common_state, is_safe
     from jointctl.tools.verbs.bench_drive import stop_targets
 
     path = config_path(config)
@@ -32,20 +32,22 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     def switch_off() -> None:
         failures.clear()
         try:
-            states[:] = _switch_off(targets, output)
+            states[:] = _switch_off(list(targets.values()), output)
         except Exception as error:  # whatever it is, the program that controls the drive has still to be ended
             failures.append(error)
 
     with ExitStack() as stack:
-        calls = [stack.enter_context(StopCall(*on)) for on in dict.fromkeys(target.place for target in targets)]
+        calls = [
+            stack.enter_context(StopCall(*on)) for on in dict.fromkeys(target.place for target in targets.values())
+        ]
         switch_off()
         from jointctl.tools.session.result import require_off  # takes its time to load: before the last look
 
         end_programs(calls, output.note, switch_off)
     if failures:
         raise failures[0]
-    state = common_state([f"drive {number}" for number in range(1, len(states) + 1)], states)
-    which = "the drive is" if len(states) == 1 else f"all {len(states)} drives:"
+    state = common_state(list(targets), states)
+    which = "the drive is" if len(states) == 1 else f"{'all' if is_safe(state) else 'of'} {len(states)} drives:"
     try:
         output.result(f"{which} {state}", {"drive_state": state}, state)
     finally:  # a result that cannot be written must not hide that the drive is not off

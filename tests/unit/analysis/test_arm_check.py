@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -161,6 +162,26 @@ def test_check_refuses_what_the_gate_of_a_run_refuses(arm: ArmConfig) -> None:
     joints = (*arm.joints[:2], changed(arm.joints[2], control__adaptation=None, control__learning=learning))
     with pytest.raises(MarginError, match="wrist: iterative learning would diverge"):
         check(replace(arm, joints=joints), output()[0])
+
+
+def test_check_says_of_an_arms_joints_what_it_says_of_a_joint_alone(arm: ArmConfig) -> None:
+    first, *others = arm.joints
+    assert first.joint.torque_constant_NmpA == 0.1
+    out, shown, said = output(json=True)
+    assert check(of(arm, changed(first, joint__torque_constant_NmpA=1.0), *others), out) == 0
+    (warning,) = json.loads(shown.getvalue())["warnings"]
+    assert "shoulder.toml: joint.torque_constant_NmpA (=1 in the drive" in warning
+    assert "shoulder.toml: joint.torque_constant_NmpA" in " ".join(said.getvalue().split())
+    out, shown, said = output(json=True)
+    assert check(arm, out) == 0
+    assert json.loads(shown.getvalue())["warnings"] == []
+    assert said.getvalue() == ""
+
+
+def test_check_refuses_a_bus_that_no_arm_runs_on(arm: ArmConfig) -> None:
+    *others, last = arm.joints
+    with pytest.raises(ConfigurationError, match=r"bus.interface \(=pcan\) must be one of socketcan, jointctl"):
+        check(of(arm, *others, changed(last, bus__interface="pcan")), output()[0])
 
 
 def test_the_files_of_an_arm_of_ones_own(tmp_path: Path) -> None:

@@ -13,16 +13,30 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.errors import DataError
+from jointctl.drivers.errors import DataError, UsageError
 from jointctl.tools import virtual_joint
+from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.verbs import hil
 from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 from jointctl.tools.verbs.demo import with_patience
+from jointctl.tools.verbs.verb_options import AS_CONFIGURED
 from jointctl.tools.virtual_joint import _make_link, _target
 from tests.configurations import shipped
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"serial": True}, "--serial and --link are for"), ({"link": "/tmp/tty"}, "--serial and --link are for"),
+        ({"model": hil.ModelOptions(eds=Path("x.eds"))}, r"--eds \(=x.eds\) is for"),
+    ],
+)  # fmt: skip
+def test_an_arm_is_served_on_can_as_it_is(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words + " a single joint, and .*arm.toml is an arm"):
+        hil.hil(config=SHIPPED_ARM, bus=AS_CONFIGURED, output=Output(quiet=True), **options)
 
 
 # --- `jointctl hil`: in which order it starts ---

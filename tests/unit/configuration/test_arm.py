@@ -16,6 +16,7 @@ from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.records import trajectory_table
+from tests.places import CONFIGS
 
 
 @pytest.fixture
@@ -193,6 +194,12 @@ IN_URDF: list[tuple[str, str, str]] = [
     ),
     (r'xyz="0.05 0 0"', 'xyz="5 0 0"', "link hand: the centre of its mass is 5 m from its frame"),
     (r"<inertial>", "<inertial/><inertial>", "link upper_arm has 2 elements inertial"),
+    (
+        r'xyz="0.30 0 0"',
+        'xyz="0.30 0 0" quat_xyzw="0.6 0 0 0.8"',  # of URDF 1.2
+        "joint wrist: <origin> has quat_xyzw, must have xyz and rpy alone",
+    ),
+    (r'<origin xyz="0.05 0 0"/>', '<origin xzy="0.05 0 0"/>', "link hand: inertial: <origin> has xzy, must have xyz"),
     (r'<axis xyz="0 1 0"/>', "<axis/>", "joint shoulder: <axis> has no xyz"),
     (r'<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', "joint shoulder: axis (='0 1') must be 3 numbers"),
     (r'name="wrist" type="revolute"', 'name="wrist" type="floating"', "joint wrist: type (=floating) must be one of"),
@@ -290,6 +297,11 @@ IN_FILES: list[tuple[str, str, str, str]] = [
     ("wrist.toml", r"heartbeat_s = 0.2", "heartbeat_s = 0.3", "wrist.toml: drive.heartbeat_s (=0.3) must be that of"),
     ("wrist.toml", r"node = 3", "node = 3\nmaster_node = 99", "wrist.toml: drive.master_node (=99) must be that of"),
     ("arm.toml", r'"elbow.toml"', '"arm.toml"', "arm.joints: arm.toml must be the file of a joint, and is that of an"),
+    ("arm.toml", r"joints = \[.*?\]", "joints = []", "arm.joints (=[]) must be a list of at least 1"),
+    ("arm.toml", r"joints = \[.*?\]", f"joints = {['a.toml'] * 17}", "must be a list of at most 16"),
+    ("arm.toml", r"joints = \[.*?\]", "joints = 'a.toml'", "arm.joints (=a.toml) must be a list"),
+    ("arm.toml", r"0.0, 0.0\]  ", "0.0]", "arm.payload_at_m (=[0.1, 0.0]) must be a list of at least 3"),
+    ("arm.toml", r"1.2, 0.5, 0.12", "1.2, -0.5, 0.12", "must be 3 inertias of at least 0, one a joint"),
     ("arm.toml", r"-9.81", "-981", "arm.gravity_mps2 (=[0.0, 0.0, -981]) must be 3 numbers with a magnitude in"),
     ("arm.toml", r"payload_at_m = \[0.1", "payload_at_m = [100.0", "arm.payload_at_m.0 (=100) must be in [-10..10]"),
     ("arm.toml", r'"elbow", "wrist"\]', '"elbow"]', "arm.joint_names (=2: shoulder, elbow) must be as many as"),
@@ -324,6 +336,42 @@ IN_FILES: list[tuple[str, str, str, str]] = [
 def test_files_that_do_not_fit_together(folder: Path, name: str, pattern: str, text: str, words: str) -> None:
     change(folder / name, pattern, text)
     assert words in problem(folder)
+
+
+def test_a_drive_that_no_arm_has_is_named_before_a_motion_that_it_cannot_do(folder: Path) -> None:
+    shutil.copy(CONFIGS / "elmo_serial.toml", folder / "wrist.toml")
+    with pytest.raises(ConfigurationError) as caught:
+        load_arm(folder / "arm.toml")
+    first, *_ = caught.value.message.splitlines()
+    assert first.endswith("wrist.toml: drive.kind (=elmo_serial) must be canopen in an arm")
+    assert "[motion]" not in caught.value.message
+
+
+def test_a_file_in_the_place_of_another_joint_is_named(folder: Path) -> None:
+    """With equal limits it fits, and the torque of one joint would go to the drive of the other."""
+    shutil.copy(folder / "shoulder.toml", folder / "drive1.toml")
+    change(folder / "arm.toml", r'"shoulder.toml"', '"drive1.toml"')
+    assert not load_arm(folder / "arm.toml").remarks
+    change(folder / "arm.toml", r'"drive1.toml", "elbow.toml"', '"elbow.toml", "shoulder.toml"')
+    for name, low, high, speed, torque in (("shoulder", -1.4, 1.6, 3.0, 72.0), ("elbow", -1.4, 1.4, 3.0, 72.0)):
+        limits = {"position_min_rad": low, "position_max_rad": high, "velocity_max_radps": speed}
+        for key, value in {**limits, "torque_max_Nm": torque}.items():
+            change(folder / f"{name}.toml", rf"(?m)^{key} = \S+", f"{key} = {value}")
+    remarks = load_arm(folder / "arm.toml").remarks
+    assert remarks == (
+        "arm.joints: elbow.toml stands in the place of joint shoulder; is it that of joint elbow?",
+        "arm.joints: shoulder.toml stands in the place of joint elbow; is it that of joint shoulder?",
+    )
+
+
+@pytest.mark.parametrize(("upper", "said"), [("-0.1", ", where its limits [-2..-0.1] let it never be"), ("0", "")])
+def test_a_joint_that_cannot_stand_at_0_is_named(folder: Path, upper: str, said: str) -> None:
+    two = "[motion]\nkind = 'hold'\nduration_s = 1.0\nposition_rad = [0.0, 0.0]\n"
+    change(folder / "arm.toml", r', "wrist.toml"\](.*?), "wrist"\](.*?), 0.12\](.*?)\[motion\].*', r"]\1]\2]\3" + two)
+    change(folder / "arm.urdf", r'lower="-2.0" upper="2.0"', f'lower="-2.0" upper="{upper}"')
+    (remark,) = load_arm(folder / "arm.toml").remarks
+    assert remark.startswith(f"joint wrist of arm.urdf is not the arm's: it stands at 0{said}")
+    assert remark.endswith("another arm") == bool(said)
 
 
 def test_the_motors_inertias_may_be_in_both_places(folder: Path) -> None:

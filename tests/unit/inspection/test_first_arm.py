@@ -19,6 +19,7 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepArm
 from jointctl.tools.session.plan import resolve_arm
+from jointctl.tools.verbs.demo import demo
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.arms import long_arm
 from tests.sessions import output
@@ -117,6 +118,16 @@ def test_limits_that_are_not_like_the_templates(tmp_path: Path, limit: str) -> N
     joint_loops(arm)
 
 
+@pytest.mark.parametrize(("speed", "effort", "key"), [(50, 60, "stop_timeout_s"), (2, 20000, "rated_current_A")])
+def test_limits_that_make_no_file_say_where_they_come_from(
+    tmp_path: Path, speed: float, effort: float, key: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=key) as caught:
+        made(tmp_path, robot(joint(1, f'<limit lower="-1" upper="1" velocity="{speed}" effort="{effort}"/>'), (9.0,)))
+    assert caught.value.hint.startswith("nothing was written: it is made of the limits in own robot.urdf")
+    assert not (tmp_path / "arm").exists()
+
+
 def test_joints_that_are_not_named_stand_at_0(tmp_path: Path) -> None:
     arm = load_arm(made(tmp_path, GOOD, joints="j1"))
     assert arm.names == ("j1",)
@@ -194,6 +205,13 @@ def test_it_overwrites_nothing_and_its_options_go_together(tmp_path: Path) -> No
         new(tmp_path / "x.toml", out, urdf=urdf)
     with pytest.raises(UsageError, match="--urdf"):
         new(tmp_path / "x", out, arm=True, joints="j1")
+    with pytest.raises(UsageError, match=r"--from \(=csp\) is for a joint's file"):
+        new(tmp_path / "x", out, arm=True, shipped="csp")
+    with pytest.raises(UsageError, match=r"--from \(=arm\) is an arm"):
+        new(tmp_path / "x.toml", out, shipped="arm")
+    assert not (tmp_path / "x.toml").exists()
+    with pytest.raises(UsageError, match=r"--config \(=csp\) is for one joint"):
+        demo(Path("csp"), arm=True, output=out)
     with pytest.raises(UsageError, match="no drive"):
         new(tmp_path / "x", out, arm=True, urdf=urdf, drive=DriveOptions(node=1))
     with pytest.raises(UsageError, match="no terminal"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -43,6 +44,14 @@ def test_the_late_part_may_begin_at_a_given_time() -> None:
     assert late is not None
     assert late.from_s == pytest.approx(0.05)
     assert late.range_rad.greatest == 2e-3
+
+
+def test_a_beginning_a_little_before_0_has_no_sign() -> None:
+    summary = summarise(run_records())
+    assert summary.error is not None
+    early = dataclasses.replace(summary, error=dataclasses.replace(summary.error, from_s=-0.01))
+    shown = list(summary_table(early).columns[0].cells)
+    assert any(str(cell).startswith("tracking error (0.0..") for cell in shown)
 
 
 def test_a_changed_motion_sets_the_loops_time_back_but_not_the_summarys() -> None:

@@ -365,6 +365,13 @@ def test_joints_of_one_arm_are_shown_together_without_differences(tmp_path: Path
     assert "different motions" not in html
 
 
+def test_two_joints_of_one_arm_are_not_taken_from_each_other(tmp_path: Path) -> None:
+    html = made(arm_logs(tmp_path, 2))
+    assert "Tracking error of each joint." in html
+    assert ">difference<" not in html
+    assert ">difference<" in made([write_log(tmp_path / f"{i}.mcap", run_records()) for i in range(2)])
+
+
 def test_joints_of_two_arms_are_compared(tmp_path: Path) -> None:
     html = made(arm_logs(tmp_path, 2, arms=2))
     assert "axis1 less arm-1." in html

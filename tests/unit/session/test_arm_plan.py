@@ -162,10 +162,12 @@ def test_a_channel_that_is_given_is_that_of_the_first_virtual_bus(on_two_buses: 
     arm = arm_on_bus(load_arm(on_two_buses), given)
     assert [joint.bus.channel for joint in arm.joints] == ["mine", "mine", "mine.2"]
     targets, unread = stop_targets(on_two_buses, given)
-    assert [target.place for target in targets] == [(joint.bus.interface, joint.bus.channel) for joint in arm.joints]
+    assert [target.place for target in targets.values()] == [
+        (joint.bus.interface, joint.bus.channel) for joint in arm.joints
+    ]
     assert not unread
     targets, _ = stop_targets(on_two_buses)
-    assert [target.place[1] for target in targets] == ["virtual0", "virtual0", "virtual1"]
+    assert [target.place[1] for target in targets.values()] == ["virtual0", "virtual0", "virtual1"]
 
 
 def test_one_channel_is_refused_where_the_buses_are_real(on_two_buses: Path) -> None:

@@ -340,6 +340,22 @@ def result(folder: Path, fault: Fault) -> RunResult:
     )  # fmt: skip
 
 
+def test_a_picture_is_called_by_what_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    titles: list[str] = []
+    monkeypatch.setattr(run_report, "save_run_figure", lambda records, path, title: titles.append(title) or path)
+    for motion in ("", "hold"):
+        run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=io.StringIO()), CONFIG, motion)
+    assert titles == [f"{CONFIG.path.stem}: {CONFIG.trajectory.kind}", f"{CONFIG.path.stem}: hold"]
+
+
+@pytest.mark.parametrize(("joints", "words"), [(1, "the joint is off"), (2, "the joints are off")])
+def test_what_was_stopped_is_off(tmp_path: Path, joints: int, words: str) -> None:
+    one = replace(result(tmp_path, Fault.NONE), stopped_by="SIGINT")
+    found, err = replace(one, others=(one,) * (joints - 1)), io.StringIO()
+    assert run_report.report_run(found, Output(stdout=io.StringIO(), stderr=err), WITHOUT_PICTURE) == 130
+    assert err.getvalue() == f"stopped by SIGINT; {words}\n"
+
+
 @pytest.mark.parametrize(("fault", "code"), [(Fault.BUS_ERROR, 7), (Fault.NONE, 0)])
 def test_the_cause_is_told_before_the_picture_is_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Fault, code: int

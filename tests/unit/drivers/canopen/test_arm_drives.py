@@ -15,9 +15,10 @@ import pytest
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.drive import UNTOUCHED, DriveGroup, common_state, is_safe
-from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
+from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError, UsageError
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.records import NmtState, PowerState
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs import bench_drive
 from jointctl.tools.virtual_joint import new_devices
@@ -262,8 +263,25 @@ def test_stop_finds_every_joint_of_an_arm_whatever_else_its_files_say(tmp_path: 
     path = tmp_path / "arm.toml"
     path.write_text('[arm]\njoints = ["1.toml", "2.toml", "3.toml"]\nthis is no TOML\n')
     targets, unread = bench_drive.stop_targets(path)
-    assert ([target.node for target in targets], unread) == ([1, 2, 3], [])  # type: ignore[attr-defined]
+    assert ({name: target.node for name, target in targets.items()}, unread) == (  # type: ignore[attr-defined]
+        {"1.toml": 1, "2.toml": 2, "3.toml": 3}, [],
+    )  # fmt: skip
     (tmp_path / "2.toml").unlink()
     targets, unread = bench_drive.stop_targets(path)
-    assert [target.node for target in targets] == [1, 3]  # type: ignore[attr-defined]
+    assert {name: target.node for name, target in targets.items()} == {"1.toml": 1, "3.toml": 3}  # type: ignore[attr-defined]
     assert len(unread) == 1
+
+
+def test_a_node_that_is_given_is_not_that_of_every_joint_of_an_arm(tmp_path: Path) -> None:
+    """One drive asked three times was said to be three that are off."""
+    text = (CONFIGS / "virtual.toml").read_text()
+    for node in NODES:
+        (tmp_path / f"{node}.toml").write_text(text.replace("node = 1", f"node = {node}", 1))
+    path = tmp_path / "arm.toml"
+    path.write_text('[arm]\njoints = ["1.toml", "2.toml", "3.toml"]\n')
+    targets, (problem,) = bench_drive.stop_targets(path, GivenPlace(node=2))
+    assert [target.node for target in targets.values()] == [1, 2, 3]  # type: ignore[attr-defined]
+    assert isinstance(problem, UsageError)
+    assert problem.message.startswith(f"--target (=2) is one joint's, and {path} is an arm")
+    targets, unread = bench_drive.stop_targets(tmp_path / "1.toml", GivenPlace(node=2))
+    assert ([target.node for target in targets.values()], unread) == ([2], [])  # type: ignore[attr-defined]
