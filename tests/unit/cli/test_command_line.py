@@ -33,7 +33,7 @@ from jointctl.tools.verbs.elmo_bench import ElmoBench
 from jointctl.tools.verbs.main import EPILOG, app
 from jointctl.tools.verbs.new import new
 from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, grouped, loaded
-from tests.configurations import SLOW_LOOP, written
+from tests.configurations import SLOW_LOOP, edited_file, written
 from tests.python_process import Finished
 
 Jointctl = Callable[..., Finished]
@@ -118,9 +118,15 @@ sys.exit(stop.stop(Path(sys.argv[1]), main.Output(quiet=True)))
 """
 
 
-@pytest.mark.parametrize("config", ["virtual", "elmo_serial"])
-def test_nothing_that_takes_its_time_is_loaded_before_the_drive_is_stopped(config: str) -> None:
-    shown = subprocess.run([sys.executable, "-c", STOP, config], capture_output=True, text=True, check=True)
+@pytest.mark.parametrize(
+    ("base", "place"), [("virtual", 'channel = "virtual0"'), ("elmo_serial", 'port = "/dev/ttyUSB0"')]
+)
+def test_nothing_that_takes_its_time_is_loaded_before_the_drive_is_stopped(
+    tmp_path: Path, base: str, place: str
+) -> None:
+    own = place.replace("0", f"-{os.getpid()}")  # a stop ends the programs of other tests there
+    path = str(edited_file(tmp_path, (place, own), base=base))
+    shown = subprocess.run([sys.executable, "-c", STOP, path], capture_output=True, text=True, check=True)
     assert shown.stdout.splitlines()[0] == "[]"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -35,7 +36,7 @@ from jointctl.tools.session.result import require_off, words
 from jointctl.tools.verbs import canopen_bench
 from jointctl.tools.verbs import run as run_module
 from jointctl.tools.verbs import stop as stop_module
-from tests.places import CONFIGS
+from tests.configurations import edited_file
 from tests.unit.drivers.canopen.wire import STATUSWORDS
 
 ENABLED, SWITCHED_ON = 0x27, 0x23
@@ -228,32 +229,41 @@ def test_on_a_dead_bus_the_state_is_unknown() -> None:
 
 
 # --- the verb ---
+@pytest.fixture
+def stopped_file(tmp_path: Path) -> Path:
+    """A configuration with a channel that no other test runs a program on: a stop ends all of them."""
+    return edited_file(tmp_path, ('channel = "virtual0"', f'channel = "stopped{os.getpid()}"'))
+
+
 @pytest.mark.parametrize("spoilt", [True, False])
 def test_stop_is_sent_whatever_the_file_says_elsewhere(
-    joint: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: bool, capsys: Any
+    joint: Any, stopped_file: Path, monkeypatch: pytest.MonkeyPatch, spoilt: bool, capsys: Any
 ) -> None:
-    text = (CONFIGS / "virtual.toml").read_text()
-    path = tmp_path / "joint.toml"
-    path.write_text(text.replace("[control]", "[control]\nkp = -3", 1) if spoilt else text)
+    if spoilt:
+        stopped_file.write_text(stopped_file.read_text().replace("[control]", "[control]\nkp = -3", 1))
     monkeypatch.setattr(canopen_bench, "open_python_can", lambda *_, **__: bus_of(joint))
     power_up(joint)
-    assert stop_module.stop(path, Output()) == 0
+    assert stop_module.stop(stopped_file, Output()) == 0
     assert not powered(joint)
     told = capsys.readouterr()
     assert "the drive is switch on disabled" in told.out
     assert ("warning: the stop was sent, but the configuration does not hold" in told.err) is spoilt
 
 
-def test_a_stop_that_is_not_confirmed_is_an_error(joint: Any, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_a_stop_that_is_not_confirmed_is_an_error(
+    joint: Any, stopped_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
     monkeypatch.setattr(canopen_bench, "open_python_can", lambda *_, **__: bus_of(joint))
     joint.answers[0x6041, 0] = ENABLED
     with pytest.raises(DeviceError, match="use the emergency stop"):
-        stop_module.stop(CONFIGS / "virtual.toml", Output())
+        stop_module.stop(stopped_file, Output())
     assert "operation enabled" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("again", [True, False])
-def test_whatever_goes_wrong_with_the_drive_its_program_is_ended(monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
+def test_whatever_goes_wrong_with_the_drive_its_program_is_ended(
+    stopped_file: Path, monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
     """No thread could be started, say, as long as that program had them all."""
     tries, calls = [RuntimeError("can't start new thread")], []
 
@@ -271,17 +281,17 @@ def test_whatever_goes_wrong_with_the_drive_its_program_is_ended(monkeypatch: py
     monkeypatch.setattr(canopen_bench.CanTarget, "switch_off", switch_off)
     monkeypatch.setattr(bus_lock, "end_programs", end_programs)
     with nullcontext() if again else pytest.raises(RuntimeError, match="new thread"):
-        assert stop_module.stop(CONFIGS / "virtual.toml", Output(quiet=True)) == 0
+        assert stop_module.stop(stopped_file, Output(quiet=True)) == 0
     assert len(calls) == 1
 
 
 @pytest.mark.parametrize(("state", "error"), [("operation enabled", DeviceError), ("switch on disabled", DataError)])
 def test_a_full_disk_behind_its_output_does_not_hide_it(
-    monkeypatch: pytest.MonkeyPatch, state: str, error: type[Exception]
+    stopped_file: Path, monkeypatch: pytest.MonkeyPatch, state: str, error: type[Exception]
 ) -> None:
     monkeypatch.setattr(canopen_bench.CanTarget, "switch_off", lambda *_: state)
     with Path("/dev/full").open("w") as full, pytest.raises(error):
-        stop_module.stop(CONFIGS / "virtual.toml", Output(stdout=full))
+        stop_module.stop(stopped_file, Output(stdout=full))
 
 
 # --- the watchdog ---
