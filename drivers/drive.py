@@ -5,12 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from functools import partial
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from jointctl.drivers.errors import DeviceError
 from jointctl.firmware_py.kernel import kernel
+
+T = TypeVar("T")
 
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
 Approval = Callable[[str], bool]  # of a question, by the user
@@ -131,6 +134,38 @@ class Drive(Protocol):
 # --- The drives that one loop commands ---
 
 
+def at_once(calls: Sequence[Callable[[], T]]) -> list[T]:
+    """What they return, carried out at the same time; one after the other where no thread can be started.
+
+    The first error among them is raised when all have ended.  An executor would take nothing at all once the main
+    thread has ended, which a program's own thread may survive.
+    """
+    results: dict[int, T] = {}
+    errors: dict[int, Exception] = {}
+
+    def carry_out(number: int) -> None:
+        try:
+            results[number] = calls[number]()
+        except Exception as error:
+            errors[number] = error
+
+    here, threads = [0], []
+    for number in range(1, len(calls)):
+        thread = threading.Thread(target=carry_out, args=(number,))
+        try:
+            thread.start()
+            threads.append(thread)
+        except RuntimeError:
+            here.append(number)
+    for number in here:
+        carry_out(number)
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[min(errors)]
+    return [results[number] for number in range(len(calls))]
+
+
 @runtime_checkable
 class DriveOfArm(Protocol):
     """What a drive offers besides where it is one of several: its two long steps in two parts each."""
@@ -175,29 +210,8 @@ class DriveGroup:
         return ports
 
     def make_safe(self, *, asked: bool = False) -> list[str]:
-        """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer.
-
-        One after the other where no thread can be started.  An executor would take nothing at all once the main thread
-        has ended, which a program's own thread may survive.
-        """
-        states = ["unknown: switching off has failed"] * len(self.drives)
-
-        def switch_off(axis: int) -> None:
-            states[axis] = self.drives[axis].make_safe(asked=asked)
-
-        here, threads = [0], []
-        for axis in range(1, len(self.drives)):
-            thread = threading.Thread(target=switch_off, args=(axis,))
-            try:
-                thread.start()
-                threads.append(thread)
-            except RuntimeError:
-                here.append(axis)
-        for axis in here:
-            switch_off(axis)
-        for thread in threads:
-            thread.join()
-        return states
+        """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer."""
+        return at_once([partial(drive.make_safe, asked=asked) for drive in self.drives])
 
     def close(self) -> None:
         """Release the bus."""

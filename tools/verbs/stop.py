@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,11 +61,9 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
 
 def _switch_off(targets: Sequence[StopTarget], output: Output) -> list[str]:
     """Of all drives at once: none waits for another one that does not answer.  An error when all have been tried."""
-    if len(targets) == 1:
-        return [targets[0].switch_off(output)]
-    with ThreadPoolExecutor(len(targets)) as pool:
-        tries = [pool.submit(target.switch_off, output) for target in targets]
-    return [each.result() for each in tries]
+    from jointctl.drivers.drive import at_once
+
+    return at_once([partial(target.switch_off, output) for target in targets])
 
 
 def _warn_of(path: Path, output: Output) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import struct
 import threading
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ import pytest
 
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.drivers.drive import UNTOUCHED, DriveGroup, common_state, is_safe
+from jointctl.drivers.drive import UNTOUCHED, DriveGroup, at_once, common_state, is_safe
 from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError, UsageError
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.records import NmtState, PowerState
@@ -211,6 +212,26 @@ def test_each_drive_is_switched_off_where_no_more_threads_can_be_started(
         states = arm.group.make_safe()
     assert [is_safe(state) for state in states] == [True] * 3
     assert not any(int(arm.device(axis).state) == PowerState.OPERATION_ENABLED for axis in range(3))
+
+
+@pytest.mark.parametrize("threads", [True, False])
+def test_an_error_of_one_is_raised_when_all_have_been_tried(monkeypatch: pytest.MonkeyPatch, threads: bool) -> None:
+    tried = []
+
+    def call(number: int) -> int:
+        tried.append(number)
+        if number != 1:
+            raise BusError(f"no answer of {number}")
+        return number
+
+    def exhausted(_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    if not threads:
+        monkeypatch.setattr(threading.Thread, "start", exhausted)
+    with pytest.raises(BusError, match="no answer of 0"):
+        at_once([functools.partial(call, number) for number in range(3)])
+    assert sorted(tried) == [0, 1, 2]
 
 
 GROUP = """
