@@ -277,32 +277,37 @@ def test_an_arm_is_off_only_if_every_drive_is(states: tuple[str, ...], common: s
     assert is_safe(common) is safe
 
 
-def test_stop_finds_every_joint_of_an_arm_whatever_else_its_files_say(tmp_path: Path) -> None:
-    text = (CONFIGS / "virtual.toml").read_text()
-    for node in NODES:
-        (tmp_path / f"{node}.toml").write_text(text.replace("node = 1", f"node = {node}", 1))
-    path = tmp_path / "arm.toml"
-    path.write_text('[arm]\njoints = ["1.toml", "2.toml", "3.toml"]\nthis is no TOML\n')
-    targets, unread = bench_drive.stop_targets(path)
-    assert ({name: target.node for name, target in targets.items()}, unread) == (  # type: ignore[attr-defined]
-        {"1.toml": 1, "2.toml": 2, "3.toml": 3}, [],
-    )  # fmt: skip
-    (tmp_path / "2.toml").unlink()
-    targets, unread = bench_drive.stop_targets(path)
-    assert {name: target.node for name, target in targets.items()} == {"1.toml": 1, "3.toml": 3}  # type: ignore[attr-defined]
-    assert len(unread) == 1
-
-
-def test_a_node_that_is_given_is_not_that_of_every_joint_of_an_arm(tmp_path: Path) -> None:
-    """One drive asked three times was said to be three that are off."""
+@pytest.fixture
+def arm_file(tmp_path: Path) -> Path:
+    """An arm of three joints, whose files are named after their nodes."""
     text = (CONFIGS / "virtual.toml").read_text()
     for node in NODES:
         (tmp_path / f"{node}.toml").write_text(text.replace("node = 1", f"node = {node}", 1))
     path = tmp_path / "arm.toml"
     path.write_text('[arm]\njoints = ["1.toml", "2.toml", "3.toml"]\n')
-    targets, (problem,) = bench_drive.stop_targets(path, GivenPlace(node=2))
-    assert [target.node for target in targets.values()] == [1, 2, 3]  # type: ignore[attr-defined]
+    return path
+
+
+def nodes_of(targets: dict[str, Any]) -> dict[str, int]:
+    return {name: target.node for name, target in targets.items()}
+
+
+def test_stop_finds_every_joint_of_an_arm_whatever_else_its_files_say(arm_file: Path) -> None:
+    with arm_file.open("a") as file:
+        file.write("this is no TOML\n")
+    targets, unread = bench_drive.stop_targets(arm_file)
+    assert (nodes_of(targets), unread) == ({"1.toml": 1, "2.toml": 2, "3.toml": 3}, [])
+    arm_file.with_name("2.toml").unlink()
+    targets, unread = bench_drive.stop_targets(arm_file)
+    assert nodes_of(targets) == {"1.toml": 1, "3.toml": 3}
+    assert len(unread) == 1
+
+
+def test_a_node_that_is_given_is_not_that_of_every_joint_of_an_arm(arm_file: Path) -> None:
+    """One drive asked three times was said to be three that are off."""
+    targets, (problem,) = bench_drive.stop_targets(arm_file, GivenPlace(node=2))
+    assert list(nodes_of(targets).values()) == [1, 2, 3]
     assert isinstance(problem, UsageError)
-    assert problem.message.startswith(f"--target (=2) is one joint's, and {path} is an arm")
-    targets, unread = bench_drive.stop_targets(tmp_path / "1.toml", GivenPlace(node=2))
-    assert ([target.node for target in targets.values()], unread) == ([2], [])  # type: ignore[attr-defined]
+    assert problem.message.startswith(f"--target (=2) is one joint's, and {arm_file} is an arm")
+    targets, unread = bench_drive.stop_targets(arm_file.with_name("1.toml"), GivenPlace(node=2))
+    assert (nodes_of(targets), unread) == ({"1.toml": 2}, [])
