@@ -273,7 +273,7 @@ def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     raise_if([f"{path}: {line}" for line in (*bus_problems(arm, alone), *_limit_problems(arm, alone, bodies))])
     joints = _moved(path, file.motion, alone, names)
     remarks += _files_of_others(arm, names)
-    odd = (*urdf.remarks, *_odd_limits(bodies), *_odd_effort(bodies))
+    odd = (*urdf.remarks, *_without_mass(urdf, bodies), *_odd_limits(bodies), *_odd_effort(bodies))
     remarks += [f"{urdf.path.name}: {line}" for line in odd]
     for config, body in zip(joints, bodies, strict=True):
         remarks += [f"{config.path.name}: {line}" for line in _larger(config, body)]
@@ -468,10 +468,18 @@ def _limit_problems(arm: ArmSection, joints: tuple[Config, ...], bodies: list[Bo
     return found
 
 
-# --- Magnitudes that are allowed, but look like another unit: remarks, where no usual robot has them ---
+# --- What is allowed, but looks like a mistake, such as another unit: remarks, where no usual robot has it ---
 
 _NMM = 300.0  # times too large: 1000 from Nm to Nmm, and a torque limit may be a third of the effort
 _LEAST_EFFORT = 0.01  # of what the arm weighs when it is stretched: 0.001 from g to kg and from mm to m
+
+
+def _without_mass(urdf: Urdf, bodies: Sequence[Body]) -> Iterator[str]:
+    """A frame that moves, and carries its body by a fixed joint; or a body that was forgotten."""
+    for body in bodies:
+        if urdf.links[body.joint.child] is None:
+            what = f"link {body.joint.child}, which joint {body.joint.name} moves, has no <inertial>"
+            yield f"{what}: it has the mass of what is fixed to it, {body.mass.mass_kg:.3g} kg"
 
 
 def _odd_limits(bodies: Sequence[Body]) -> Iterator[str]:

@@ -401,13 +401,16 @@ def bodies_of(urdf: Urdf, names: tuple[str, ...], problem: Callable[[str], None]
             own = Pose(upright.T, np.zeros(3))
             bodies[i] = Body(parent, joint, at, own, NO_MASS)
             place[joint.child] = i, own
-            if mass is None:
-                problem(f"link {joint.child}, which joint {joint.name} moves, has no <inertial>: its mass is needed")
         else:
             place[joint.child] = parent, pose @ joint.origin
         body, own = place[joint.child]
         if mass is not None:
             parts[body].append(mass.seen_from(own))
+    for i in sorted(bodies):
+        if not parts[i]:
+            joint = bodies[i].joint
+            what = f"link {joint.child}, which joint {joint.name} moves"
+            problem(f"{what}, has no <inertial>, nor has a link that is fixed to it: its mass is needed")
     return [
         Body(bodies[i].parent, bodies[i].joint, bodies[i].place, bodies[i].frame, sum(parts[i], start=NO_MASS))
         for i in sorted(bodies)

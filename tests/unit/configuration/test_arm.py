@@ -84,6 +84,20 @@ URDF = """<robot name="skew">
 </robot>"""
 
 
+def test_a_link_whose_mass_is_that_of_what_is_fixed_to_it(folder: Path) -> None:
+    """Some programs write a frame that moves, and its body beyond a fixed joint: the same arm."""
+    before = load_arm(folder / "arm.toml")
+    fixed = '</link><joint name="f" type="fixed"><parent link="hand"/><child link="body"/></joint><link name="body">'
+    change(folder / "arm.urdf", r'(<link name="hand">)', r"\1" + fixed)
+    arm = load_arm(folder / "arm.toml")
+    mass_kg = before.bodies[-1].mass.mass_kg
+    words = (
+        f"link hand, which joint wrist moves, has no <inertial>: it has the mass of what is fixed to it, {mass_kg:.3g}"
+    )
+    assert [line for line in arm.remarks if line not in before.remarks] == [f"arm.urdf: {words} kg"]
+    assert arm.model.links.tobytes() == before.model.links.tobytes()
+
+
 def test_fixed_parts_skew_axes_and_joints_that_are_not_the_arms(folder: Path) -> None:
     (folder / "arm.urdf").write_text(URDF)
     change(folder / "arm.toml", r'\["shoulder.toml.*?\]', '["shoulder.toml", "elbow.toml"]')
