@@ -142,6 +142,7 @@ class CanopenPort:
     ignored_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
     malformed: i8  # TPDOs that were too short
     error_frames: i8
+    of_others: i8  # RPDOs to the drive that differ from the newest of ours: another controller's
     send_failures: i8
     consecutive_failures: i4
     last_errno: i4

@@ -161,14 +161,34 @@ def _note_sent(port: CanopenPort, sample: Sample, error: int, last: bool) -> Non
 
 
 @kernel
-def _drain(ports: np.ndarray, frames: np.ndarray, samples: np.ndarray, now_ns: int) -> bool:
+def differs(frame: Frame, sent: Frame) -> bool:
+    """Whether a frame has other data than one that was sent."""
+    for i in range(min(frame.length, 8)):
+        if frame.payload[i] != sent.payload[i]:
+            return True
+    return frame.length != sent.length
+
+
+@kernel
+def _note_others(port: CanopenPort, frame: Frame, own_rpdo: Frame, own_offset: Frame) -> None:
+    """Count set-points that this loop has not sent.  The system hands nobody its own frames; one that is repeated to
+    us all the same, by an adapter, is like ours."""
+    if frame.can_id == port.rpdo_id:
+        port.of_others += 1 if differs(frame, own_rpdo) else 0
+    elif port.offset_rpdo_id != 0 and frame.can_id == port.offset_rpdo_id:
+        port.of_others += 1 if differs(frame, own_offset) else 0
+
+
+@kernel
+def _drain(link: CanopenLink, samples: np.ndarray, now_ns: int) -> bool:
     """Take every frame that is waiting; True if a sample was among them (of several, the last one counts)."""
-    found = False
+    ports, frames, found = link.port, link.frames, False
     for bus in range(len(ports)):
         while ports[bus].bus == bus and receive_frame(ports[bus].fd, frames, SLOT_RECEIVED) == 1:
             for axis in range(bus, len(ports)):
                 if ports[axis].bus == bus:
                     found |= accept_frame(ports[axis], frames[SLOT_RECEIVED], samples[axis], now_ns)
+                    _note_others(ports[axis], frames[SLOT_RECEIVED], link.batch.frames[axis], frames[SLOT_OFFSET])
     return found
 
 
@@ -235,7 +255,7 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
     ports, frames = link.port, link.frames
     for axis in range(len(ports)):
         note_wake(ports[axis], now_ns)
-    _drain(ports, frames, samples, now_ns)
+    _drain(link, samples, now_ns)
     owed = _any_owed(ports)
     to_send = FRAME_SLOTS
     for axis in range(len(ports)):  # a drive that ignores a stop keeps the heartbeat from all, on every bus
@@ -244,7 +264,7 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
     started_ns = monotonic_ns(link.scratch)
     arrived_ns = started_ns
     while arrived_ns <= until_ns + LOOK_LATE_NS:
-        if _drain(ports, frames, samples, arrived_ns) and not owed and not _any_owed(ports):
+        if _drain(link, samples, arrived_ns) and not owed and not _any_owed(ports):
             return monotonic_ns(link.scratch) - started_ns
         if arrived_ns >= until_ns:
             return arrived_ns - started_ns

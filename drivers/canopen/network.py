@@ -56,6 +56,13 @@ class BusFailure(can.Listener):
         self._sleep(FAILURE_PAUSE_S)
 
 
+def another_controller(found: str) -> BusError:
+    """`found`: the frames that show it."""
+    return BusError(
+        f"another controller is active on this bus: {found}", "end it first; only one controller may use the bus"
+    )
+
+
 class OtherControllers(can.Listener):
     """Notices what only a controller sends: SYNC, NMT, SDO requests, RPDOs and node guarding of `nodes`, our heartbeat.
 
@@ -192,10 +199,7 @@ class OtherControllers(can.Listener):
     def refuse(self) -> None:
         """`BusError` where another controller has the drive: two of them would fight over it."""
         if found := self.found():
-            raise BusError(
-                f"another controller is active on this bus: {found}",
-                hint="end it first; only one controller may use the bus",
-            )
+            raise another_controller(found)
 
 
 def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can.Listener) -> canopen.Network:

@@ -126,6 +126,18 @@ def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
     assert again.code == 0, again.err
 
 
+@pytest.mark.parametrize("data", [b"\x0f\0\x2c\x01", b"\x06\0\0\0"], ids=["torque", "shutdown"])
+def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, data: bytes) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("  tracking")
+    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
+        foreign.send(can.Message(arbitration_id=0x201, data=data, is_extended_id=False))
+        done = run.finished(20.0)
+    done.refused(7, "another controller is active on this bus: 1 x RPDO to node 1 (201h) with other commands")
+    assert bench.disabled()
+
+
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)

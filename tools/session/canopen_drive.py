@@ -102,6 +102,15 @@ class CanopenSession(SessionDrive):
         of_others = sum(int(port.cycle) * worst_frame_bits(int(port.rpdo_length)) for port in others)
         return float(first.bits_sent) + of_others
 
+    def refuse_others(self, port: np.recarray) -> None:
+        one = port[0]
+        if one.of_others:
+            from jointctl.drivers.canopen.network import another_controller
+
+            raise another_controller(
+                f"{one.of_others} x RPDO to node {one.node} ({one.rpdo_id:03X}h) with other commands"
+            )
+
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"
 

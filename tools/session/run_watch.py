@@ -382,7 +382,7 @@ class RunWatch:
                 self._stopped_by_viewer = self.display.stop_reason()
             text = f"{in_words(request)} asked for by {self.stopped_by}"
             self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
-        self._guard_settings()
+        self.guard_settings(may_ask=self.delay_s is not None)  # reads lengthen the delay that is measured
         self.check_delay()
         self._may_enable()
         self.temperature.poll()
@@ -397,14 +397,15 @@ class RunWatch:
             self._phase = phase
             self.display.phase(phase_name(phase))
 
-    def _guard_settings(self) -> None:
+    def guard_settings(self, *, may_ask: bool) -> None:
         """`DeviceError` or `BusError` where what stops the drive without us has been changed, or someone else commands.
 
-        Its reads would lengthen the delay that is measured.
+        `may_ask`: whether it may read objects of the drive.
         """
+        self._drive.refuse_others(self.loop.block.port)
         if self.settings_guard is None:
             return
-        for text in self.settings_guard.poll(may_ask=self.delay_s is not None):
+        for text in self.settings_guard.poll(may_ask=may_ask):
             self.log.write_event(WARNING, "drive", text)
             self.display.note(text)
 

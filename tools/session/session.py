@@ -321,10 +321,10 @@ class Session:
 
     def _raise_what_others_did(self, watch: RunWatch, loop: LoopHandle) -> None:
         """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
-        if watch.settings_guard is None or watch.around.signals.commanded_ns:
+        if watch.around.signals.commanded_ns:
             return
         try:
-            watch.settings_guard.poll(may_ask=False)  # an answer would come into the way of switching off
+            watch.guard_settings(may_ask=False)  # an answer would come into the way of switching off
         except (DeviceError, BusError) as error:
             if self._explained_by_restart(error, loop):
                 return

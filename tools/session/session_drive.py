@@ -99,6 +99,9 @@ class SessionDrive(ABC):
         """On the joint's bus or line in this run, `ports` the records of the exchange of all joints."""
         return float(ports[0].bits_sent)
 
+    def refuse_others(self, port: np.recarray) -> None:  # noqa: B027  (a serial line has one user)
+        """`BusError` where set-points have reached the drive that the loop has not sent; `port`: its record."""
+
     @abstractmethod
     def load_row(self, share: float) -> tuple[str, str]:
         """Name and text of the measured load of bus or line, for the summary of a run."""

@@ -501,6 +501,18 @@ def test_its_twin_a_drive_that_does_not_answer_costs_the_window_and_not_the_othe
     assert list(two_drives.samples["count"]) == [1 - answering, answering]
 
 
+def test_rpdos_of_another_controller_are_counted_for_their_drive(two_drives: TwoDrives) -> None:
+    two_drives.commands["torque_Nm"] = 3.0
+    two_drives.cycle(30.0, 0, 1)
+    own = bytes(two_drives.link.batch.frames[1].payload[:4])
+    for data in (b"\x0f\0\x64\0", b"\x0f\0", b"\x06\0\0\0"):  # torque, one that is too short, another command
+        two_drives.bus.send(struct.pack("<IB3x8s", 0x206, len(data), data))
+    for identifier, data in ((0x206, own), (0x306, b"\x0f\0\x64\0"), (0x80000206, b"\x0f\0\x64\0")):
+        two_drives.bus.send(struct.pack("<IB3x8s", identifier, 4, data))  # none: as ours, not the drive's, not standard
+    two_drives.cycle(30.0, 0, 1)
+    assert list(two_drives.ports["of_others"]) == [0, 3]
+
+
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_a_drive_that_ignores_a_stop_costs_both_the_heartbeat(two_drives: TwoDrives, deaf: int) -> None:
     two_drives.ports[deaf].ignored_cycles = IGNORED_MAX_CYCLES + 1
