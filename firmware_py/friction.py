@@ -269,13 +269,13 @@ def step_lugre(
 # While the desired motion rests nothing adapts, and what friction holds is anything.  The observer, which goes on
 # until the joint is where it should be, would find that torque, and take it along into the next move as a disturbance.
 # What it adds after a move has ended is therefore handed over to the bristles, which hold it until they slide
-# (`take_at_rest`).
+# (`take_at_rest`; without adaptation `take_unadapted_at_rest`, the same with the bristles as configured).
 #
 # Where a move has ended the bristles are near their limit, and creep on in its direction with every count of the
 # encoder and every Nm that is fed forward too much.  They have to be let go: by as much as the joint is seen to go on,
 # and of a joint that is not rigid, whose gains are too low to hold it, by half at once.  They spring back by what they
-# were let go of, over their stiffness as it was found (`_let_go`).  There the joint is a spring, and for a moment an
-# integrator of that stiffness takes a rigid one back to within a count; for longer it would swing between two counts.
+# were let go of, over their stiffness as it was found (`_share_kept`).  There the joint is a spring, and for a moment
+# an integrator of that stiffness takes a rigid one back; for longer it would swing between two counts.
 # Of a joint that is not rigid the observer is slow as well: what it has found on arrival is mostly friction of this
 # direction.  It keeps the mean of both directions, which is a load.
 #
@@ -291,7 +291,7 @@ MOST = 1.2  # that a kind of bristles may weigh
 LEAST_SHARE = 0.5  # of the bristles that take something over
 TAKEN_radps = 20.0  # slow: with a reducer that is not rigid, friction moves the desired motor angle as well
 LET_GO = 3.0  # by how many times their stiffness the bristles give way to a joint that goes on
-BACK_radps, BACK_s, BACK_COUNTS = 30.0, 0.08, 0.8  # a rigid one goes back, for this time, from so many counts on
+BACK_radps, BACK_s = 30.0, 0.08  # a rigid one goes back, for this time
 TURNING_CYCLES = 4  # a motion that turns back rests for one
 MOST_LET_GO, MOST_HELD = 0.8, 0.95  # of what they held when the motion came to rest
 AT_ONCE, AT_ONCE_s = 0.5, 0.03  # of a joint that is not rigid, in this time
@@ -389,34 +389,61 @@ def _held_Nm(law: LawConstants, state: AdaptationState) -> float:
 
 
 @kernel
-def _let_go(law: LawConstants, state: AdaptationState, error_rad: float) -> None:
-    """Let the bristles go where the joint goes on after the move, and take it back to where it should be.
+def _share_kept(
+    law: LawConstants, state: AdaptationState, held_Nm: float, stiffness_Nmprad: float, error_rad: float
+) -> float:
+    """How much of what the bristles hold they keep where the joint goes on after the move; above 1 takes it back.
 
     They keep at least 1 - `MOST_LET_GO` of what they held when it came to rest, and get no more than `MOST_HELD` of it.
     """
-    held = _held_Nm(law, state)
-    size, began = abs(held), abs(state.rest_friction_Nm)
-    if held * state.rest_friction_Nm <= 0.0:
-        return
-    side, stiffness = 0 if held >= 0.0 else 1, 0.0
-    for k in range(BRISTLES):
-        stiffness += STIFFNESS[k] * state.weights[2 * k + side] * law.lugre.stiffness_Nmprad
-    along_rad = math.copysign(error_rad, error_rad * held)
+    size, began = abs(held_Nm), abs(state.rest_friction_Nm)
+    if held_Nm * state.rest_friction_Nm <= 0.0:
+        return 1.0
+    along_rad = math.copysign(error_rad, error_rad * held_Nm)
     rested_s = (state.resting - TURNING_CYCLES) * law.period_s
     wanted_Nm = 0.0
     if along_rad > state.rest_error_rad:
-        wanted_Nm = LET_GO * stiffness * (along_rad - state.rest_error_rad)
+        wanted_Nm = LET_GO * stiffness_Nmprad * (along_rad - state.rest_error_rad)
         state.rest_error_rad = along_rad
     if law.kind == ControllerKind.FLEXIBLE_JOINT:
         if rested_s <= AT_ONCE_s:
             wanted_Nm += AT_ONCE * began * law.period_s / AT_ONCE_s
-    elif rested_s <= BACK_s and abs(error_rad) > BACK_COUNTS * law.adaptation.count_rad:
-        wanted_Nm += BACK_radps * law.period_s * stiffness * along_rad
+    elif rested_s <= BACK_s:
+        wanted_Nm += BACK_radps * law.period_s * stiffness_Nmprad * along_rad
     left = max(size - wanted_Nm, min(size, (1.0 - MOST_LET_GO) * began))
-    left = min(left, max(size, MOST_HELD * began))
-    for k in range(BRISTLES):
-        state.desired_deflection_rad[k] *= left / size
-        state.deflection_rad[k] = state.desired_deflection_rad[k]
+    return min(left, max(size, MOST_HELD * began)) / size
+
+
+@kernel
+def _comes_to_rest(
+    law: LawConstants, state: AdaptationState, held_Nm: float, disturbance_Nm: float, desired_radps: float,
+    error_rad: float,
+) -> bool:  # fmt: skip
+    """Whether the desired motion has rested for longer than it takes to turn back; notes how it was where it ended."""
+    if abs(desired_radps) >= STILL_radps:
+        state.resting = 0
+        side = 0 if desired_radps > 0.0 else 1
+        state.moved_s[side] = min(state.moved_s[side] + law.period_s, AVERAGED_s)
+        newer_Nm = disturbance_Nm - state.mean_disturbance_Nm[side]
+        state.mean_disturbance_Nm[side] += law.period_s / state.moved_s[side] * newer_Nm
+        return False
+    if state.resting == 0:
+        state.rest_disturbance_Nm = disturbance_Nm
+        if law.kind == ControllerKind.FLEXIBLE_JOINT and min(state.moved_s[0], state.moved_s[1]) > LEAST_MOVED_s:
+            state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
+        state.rest_friction_Nm = held_Nm
+        state.rest_error_rad = max(math.copysign(error_rad, error_rad * held_Nm), 0.0)
+    if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
+        state.resting += 1
+    return state.resting > TURNING_CYCLES
+
+
+@kernel
+def _taken_over_Nm(law: LawConstants, before_Nm: float, shift_Nm: float) -> float:
+    """What bristles hold with that on top; no more than friction can."""
+    branch = law.friction.positive if shift_Nm >= 0.0 else law.friction.negative
+    most_Nm = law.reduction_ratio * branch.static_Nm
+    return min(max(before_Nm + shift_Nm, min(before_Nm, -most_Nm)), max(before_Nm, most_Nm))
 
 
 @kernel
@@ -424,42 +451,43 @@ def take_at_rest(
     law: LawConstants, state: AdaptationState, disturbance_Nm: float, desired_radps: float, error_rad: float
 ) -> float:
     """What the bristles take over from the observer [Nm]; 0 while the desired motion goes on."""
-    if abs(desired_radps) >= STILL_radps:
-        state.resting = 0
-        side = 0 if desired_radps > 0.0 else 1
-        state.moved_s[side] = min(state.moved_s[side] + law.period_s, AVERAGED_s)
-        newer_Nm = disturbance_Nm - state.mean_disturbance_Nm[side]
-        state.mean_disturbance_Nm[side] += law.period_s / state.moved_s[side] * newer_Nm
+    held = _held_Nm(law, state)
+    if not _comes_to_rest(law, state, held, disturbance_Nm, desired_radps, error_rad):
         return 0.0
-    if state.resting == 0:
-        state.rest_disturbance_Nm = disturbance_Nm
-        if law.kind == ControllerKind.FLEXIBLE_JOINT and min(state.moved_s[0], state.moved_s[1]) > LEAST_MOVED_s:
-            state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
-        state.rest_friction_Nm = _held_Nm(law, state)
-        state.rest_error_rad = max(math.copysign(error_rad, error_rad * state.rest_friction_Nm), 0.0)
-    if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
-        state.resting += 1
-    if state.resting <= TURNING_CYCLES:
-        return 0.0
-    _let_go(law, state, error_rad)
+    side, stiffness = 0 if held >= 0.0 else 1, 0.0
+    for k in range(BRISTLES):
+        stiffness += STIFFNESS[k] * state.weights[2 * k + side] * law.lugre.stiffness_Nmprad
+    kept = _share_kept(law, state, held, stiffness, error_rad)
     wanted_Nm = TAKEN_radps * law.period_s * (disturbance_Nm - state.rest_disturbance_Nm)
-    side = 0 if wanted_Nm >= 0.0 else 1
-    branch = law.friction.positive if wanted_Nm >= 0.0 else law.friction.negative
-    most_Nm = law.reduction_ratio * branch.static_Nm
-    total = 0.0
+    side, total = 0 if wanted_Nm >= 0.0 else 1, 0.0
     for k in range(BRISTLES):
         total += state.weights[2 * k + side]
     shift_Nm = wanted_Nm / max(total, LEAST_SHARE)
     taken = 0.0
     for k in range(BRISTLES):
         stiffness = STIFFNESS[k] * law.lugre.stiffness_Nmprad
-        before = stiffness * state.desired_deflection_rad[k]
-        after = min(max(before + shift_Nm, min(before, -most_Nm)), max(before, most_Nm))
+        before = stiffness * state.desired_deflection_rad[k] * kept
+        after = _taken_over_Nm(law, before, shift_Nm)
         taken += after * state.weights[2 * k if after >= 0.0 else 2 * k + 1]
         taken -= before * state.weights[2 * k if before >= 0.0 else 2 * k + 1]
-        state.desired_deflection_rad[k] = after / stiffness
-        state.deflection_rad[k] = after / stiffness
+        state.desired_deflection_rad[k] = state.deflection_rad[k] = after / stiffness
     return taken
+
+
+@kernel
+def take_unadapted_at_rest(
+    law: LawConstants, state: AdaptationState, deflection_rad: float, disturbance_Nm: float, desired_radps: float,
+    error_rad: float,
+) -> tuple[float, float]:  # fmt: skip
+    """(deflection [rad], what they have taken over [Nm]) of the bristles as configured, as `take_at_rest`."""
+    stiffness = law.lugre.stiffness_Nmprad
+    held = stiffness * deflection_rad
+    if not _comes_to_rest(law, state, held, disturbance_Nm, desired_radps, error_rad):
+        return deflection_rad, 0.0
+    before = held * _share_kept(law, state, held, stiffness, error_rad)
+    wanted_Nm = TAKEN_radps * law.period_s * (disturbance_Nm - state.rest_disturbance_Nm)
+    after = _taken_over_Nm(law, before, wanted_Nm)
+    return after / stiffness, after - before
 
 
 @kernel

@@ -28,6 +28,7 @@ from jointctl.firmware_py.friction import (
     reset_adaptation,
     step_lugre,
     take_at_rest,
+    take_unadapted_at_rest,
 )
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference
@@ -95,25 +96,6 @@ def solve_lyapunov_p(kp: float, kv: float, q1: float, q2: float) -> tuple[float,
         raise ValueError(f"Q (=diag({q1:g}, {q2:g})) must be positive definite")
     p12, p22 = _right_column_of_p(kp, kv, q1, q2)
     return kp * p22 + kv * p12, p12, p22
-
-
-def eigenvalues(p11: float, p12: float, p22: float) -> tuple[float, float]:
-    """(smallest, largest) eigenvalue of the symmetric 2x2 matrix; the smaller without cancellation."""
-    largest = 0.5 * (p11 + p22) + math.hypot(0.5 * (p11 - p22), p12)
-    return (p11 * p22 - p12 * p12) / largest, largest
-
-
-def ultimate_bounds(
-    p11: float, p12: float, p22: float, q1: float, q2: float, inertia_kgm2: float, residual_Nm: float
-) -> tuple[float, float]:
-    """Bounds on |x| = |(e, e')| for |eps| <= residual_Nm: (as (30) prints it, the tighter one with |P B|).
-
-    (30) uses |M0^-1| lmax(P); the term that appears in V' is x^T P B eps, so |P B| is enough.
-    """
-    smallest_q = min(q1, q2)
-    loose = 2.0 * eigenvalues(p11, p12, p22)[1] / inertia_kgm2 * residual_Nm / smallest_q
-    tight = 2.0 * math.hypot(p12, p22) / inertia_kgm2 * residual_Nm / smallest_q
-    return loose, tight
 
 
 # --- The adaptive radial basis function network of (14) and (24) ---
@@ -379,9 +361,7 @@ def _adapt(
 ) -> None:  # fmt: skip
     """Adapt the friction to what the observer has found; at rest, give it what the observer has added."""
     taken_Nm = take_at_rest(constants, state.adaptation, state.observer_torque_Nm, desired_radps, error_rad)
-    state.friction_torque_Nm += taken_Nm
-    add_to_disturbance(constants.observer, state.observer, -taken_Nm)
-    state.observer_torque_Nm = state.observer.disturbance_Nm
+    _take_over(constants, state, taken_Nm)
     fed_Nm = fed_before_Nm(constants, state.adaptation, state.friction_torque_Nm + state.learned_torque_Nm)
     seen, seen_Nm = state.adaptation, state.observer_torque_Nm
     if seen.seen_motor.primed != 0:
@@ -391,6 +371,25 @@ def _adapt(
         constants, state.adaptation, seen_Nm, fed_Nm, desired_radps, position_rad,
         desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm, position_rad),
     )  # fmt: skip
+
+
+@kernel
+def _take_over(constants: LawConstants, state: LawState, taken_Nm: float) -> None:
+    """From the observer to what is fed forward."""
+    state.friction_torque_Nm += taken_Nm
+    add_to_disturbance(constants.observer, state.observer, -taken_Nm)
+    state.observer_torque_Nm = state.observer.disturbance_Nm
+
+
+@kernel
+def _rest_unadapted(constants: LawConstants, state: LawState, desired_radps: float, error_rad: float) -> None:
+    """At rest, give the friction that is fed forward what the observer has added, without adaptation."""
+    if constants.feed_forward != FeedForward.LUGRE_DESIRED or constants.observer.bandwidth_radps <= 0.0:
+        return
+    state.lugre_deflection_rad, taken_Nm = take_unadapted_at_rest(
+        constants, state.adaptation, state.lugre_deflection_rad, state.observer_torque_Nm, desired_radps, error_rad
+    )
+    _take_over(constants, state, taken_Nm)
 
 
 @kernel
@@ -494,6 +493,9 @@ def step_law(
     if constants.adaptation.enabled != 0:
         _adapt(constants, state, reference.velocity_radps, position_rad, error, error_rate, transmitted_Nm)
         rest_Nm = state.observer_torque_Nm
+    elif constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
+        _rest_unadapted(constants, state, reference.velocity_radps, error)
+        rest_Nm = state.observer_torque_Nm
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
@@ -582,6 +584,10 @@ def step_flexible_law(
                 adapt_link_share(flexible, seen, own.friction_twist_rad, link_rad - motor_rad)
         read_rad = own.target_rad + motor_rad
         _adapt(constants, state, moving_radps, read_rad, motor_rad, rate_seen_radps, transmitted_Nm)
+        known_Nm += state.friction_torque_Nm
+    else:
+        known_Nm -= state.friction_torque_Nm
+        _rest_unadapted(constants, state, own.target_radps if reference.velocity_radps != 0.0 else 0.0, motor_rad)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

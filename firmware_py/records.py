@@ -109,7 +109,6 @@ class AdaptationConstants:
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
     ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
-    count_rad: f8  # of the encoder that feeds the law
 
 
 @record

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jointctl.firmware_py.law import eigenvalues, solve_lyapunov_p, ultimate_bounds
+from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import (
     MAX_DELAY_PERIODS,
@@ -309,6 +309,25 @@ def phase_margin_deg(settings: LoopSettings) -> float:
     omega = frequencies_radps(settings.period_s, _COARSE_POINTS)
     crossings = _gain_crossings(loop, omega, np.abs(loop.open_loop(omega)))
     return math.degrees(min((abs(math.atan2(-v.imag, -v.real)) for _, v in crossings), default=math.pi))
+
+
+def eigenvalues(p11: float, p12: float, p22: float) -> tuple[float, float]:
+    """(smallest, largest) eigenvalue of the symmetric 2x2 matrix; the smaller without cancellation."""
+    largest = 0.5 * (p11 + p22) + math.hypot(0.5 * (p11 - p22), p12)
+    return (p11 * p22 - p12 * p12) / largest, largest
+
+
+def ultimate_bounds(
+    p11: float, p12: float, p22: float, q1: float, q2: float, inertia_kgm2: float, residual_Nm: float
+) -> tuple[float, float]:
+    """Bounds on |x| = |(e, e')| for |eps| <= residual_Nm: (as (30) prints it, the tighter one with |P B|).
+
+    (30) uses |M0^-1| lmax(P); the term that appears in V' is x^T P B eps, so |P B| is enough.
+    """
+    smallest_q = min(q1, q2)
+    loose = 2.0 * eigenvalues(p11, p12, p22)[1] / inertia_kgm2 * residual_Nm / smallest_q
+    tight = 2.0 * math.hypot(p12, p22) / inertia_kgm2 * residual_Nm / smallest_q
+    return loose, tight
 
 
 def theory(settings: LoopSettings) -> Theory:

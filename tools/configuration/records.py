@@ -225,7 +225,6 @@ def _fill_adaptation(record: AdaptationConstants, config: Config, adaptation: Ad
     _fill_velocity(record.seen, config, SEEN_Hz)
     _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
     record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
-    record.count_rad = law_resolution_rad(config)
     record.ripples = len(adaptation.ripple_per_motor_turn)
     for i, order in enumerate(adaptation.ripple_per_motor_turn):
         record.ripple_turns_prad[i] = ratio * order / math.tau

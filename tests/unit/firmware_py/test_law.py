@@ -13,7 +13,6 @@ from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
     adapt_network,
-    eigenvalues,
     follow_temperature,
     friction_feed_forward_Nm,
     learning_torque_Nm,
@@ -24,7 +23,6 @@ from jointctl.firmware_py.law import (
     reset_network,
     solve_lyapunov_p,
     step_law,
-    ultimate_bounds,
     watch_learning,
 )
 from jointctl.firmware_py.motion_records import Reference
@@ -51,6 +49,7 @@ from jointctl.firmware_py.records import (
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, ZeroSpeedRule
 from jointctl.firmware_py.trajectory import NO_REPETITION
+from jointctl.tools.analysis.margins import eigenvalues, ultimate_bounds
 
 # --- Velocity from position differences ---
 PERIOD_s = 1e-3
