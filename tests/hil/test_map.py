@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.drivers.errors import ConfigurationError, MarginError, MotionFault, UsageError
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
@@ -101,3 +101,25 @@ def test_the_motion_stays_within_the_limits_and_learns_nothing() -> None:
     assert config.control.learning is None
     assert config.trajectory.target_rad - config.trajectory.start_rad == pytest.approx(0.7)
     assert config.limits.position_min_rad < config.trajectory.start_rad
+
+
+def test_in_simulated_time_the_gate_and_a_dry_run_are_those_of_the_joint(tmp_path: Path) -> None:
+    stiff = load_config(written(tmp_path / "stiff.toml", "realistic", control__kp=3600.0, control__kv=120.0))
+    err = io.StringIO()
+    output = Output(stdout=io.StringIO(), stderr=err)
+    figure = tmp_path / "map.png"
+    with pytest.raises(MarginError, match=r"phase margin \(=23.7 deg\) must be at least 30 deg"):
+        map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure)
+    assert map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure, dry_run=True) == 0
+    assert "dry run: nothing moved" in err.getvalue()
+    assert not figure.exists()
+    assert map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure, allow_low_margin=True) == 0
+    assert figure.exists()
+
+
+def test_the_faults_of_the_virtual_joint_end_a_map_in_simulated_time(tmp_path: Path) -> None:
+    faulty = load_config(
+        written(tmp_path / "faulty.toml", "realistic", virtual__faults=[{"kind": "drive_fault", "at_s": 3.0}])
+    )
+    with pytest.raises(MotionFault, match="no map"):
+        map_verb(faulty, Output(stdout=io.StringIO(), stderr=io.StringIO()), options=IN_LOCKSTEP)
