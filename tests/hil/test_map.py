@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, MarginError, MotionFault, UsageError
+from jointctl.tools.analysis.reducer_map import found_map
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.map import MapOptions, config_of_map, map_verb
+from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, map_verb
 from tests.configurations import shipped, written
 
 IN_LOCKSTEP = MapOptions(travel_rad=0.5, lockstep=True)
@@ -69,6 +70,23 @@ def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_befor
         error = run.true_error_rad[run.tracking & (run.log.trajectory_s < 10.0)]
         rms.append(float(np.sqrt(np.mean(error**2))))
     assert rms[1] < 0.8 * rms[0]
+
+
+@pytest.mark.parametrize("kv", [30.0, 40.0])
+def test_bristles_that_follow_a_quick_swing_late_leave_the_ripple_in_its_interval(tmp_path: Path, kv: float) -> None:
+    light = {"joint__inertia_kgm2": 0.82, "reducer__motor_inertia_kgm2": 0.43, "virtual__motor_side_inertia_kgm2": 0.43}
+    config = load_config(
+        written(
+            tmp_path / "light.toml", "realistic", **light, reducer__map=None, control__kp=1.5 * kv**2, control__kv=kv,
+            virtual__bristle_stiffness_Nmprad=4e4,
+        )
+    )  # fmt: skip
+    moving = config_of_map(config, IN_LOCKSTEP)
+    run = LockstepJoint(moving).run()
+    assert not run.fault
+    ripple = found_map(map_run(moving, run.log, 0.0015)).ripple_Nm[9]
+    assert config.virtual is not None
+    assert abs(ripple.amplitude - config.virtual.torque_ripple_Nm[1]) < ripple.amplitude_half < 0.4 * ripple.amplitude
 
 
 @pytest.mark.parametrize(
