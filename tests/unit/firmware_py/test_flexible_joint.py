@@ -34,7 +34,9 @@ from jointctl.tools import lockstep
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.session.live_changes import new_motion
 from tests.configurations import changed, shipped, written
 
 RATIO = 121.0
@@ -367,6 +369,24 @@ def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
     changes = {"reducer__map__kinematic_error_rad": [0.0015, 2e-4], "reducer__map__torque_ripple_Nm": [59.0, -0.9]}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+
+
+def test_a_table_and_a_motion_of_a_program_leave_room_for_the_motor_too(tmp_path: Any) -> None:
+    def with_top(top_rad: float) -> Config:
+        rows = [f"{time_s},{top_rad if time_s == 2 else 0.0}" for time_s in range(5)]
+        (tmp_path / "motion.csv").write_text("\n".join(["time_s,position_rad", *rows, ""]))
+        motion = {"kind": "table", "duration_s": 4.0, "file": "motion.csv"}
+        return load_config(written(tmp_path / "joint.toml", "realistic", trajectory=motion))
+
+    words = r"limits.position_max_rad \(=0.7\) must leave room for the motor, .*: 0.70197 is reached"
+    config = with_top(0.6995)
+    with pytest.raises(ConfigurationError, match=words):
+        trajectory_table(config)
+    move = {"kind": "min_jerk", "duration_s": 2.0, "start_rad": 0.0, "target_rad": 0.6995, "move_s": 2.0}
+    with pytest.raises(ConfigurationError, match=words):
+        new_motion(config, np.zeros((1, 5)), move)
+    trajectory_table(with_top(0.697))
+    new_motion(config, np.zeros((1, 5)), move | {"target_rad": 0.697})
 
 
 def adapting() -> tuple[Any, Any]:
