@@ -8,12 +8,13 @@ import math
 from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.sections import Encoder, Friction, FrictionDirection, ReducerMap, Trajectory
+from jointctl.tools.configuration.sections import Encoder, Friction, FrictionDirection, Reducer, ReducerMap, Trajectory
 
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 LARGEST_SHARE = 0.9  # of the friction that may go with the angle
 LARGEST_SLOPE = 0.5  # of the kinematic error against the angle: beyond 1 the link would turn against the motor
+ANOTHER_UNIT = 10.0  # factor between two values of the same thing beyond which one is in another unit
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -233,6 +234,7 @@ def _reducer_problems(config: Config) -> list[str]:
             f"limits.following_error_max_rad (={config.limits.following_error_max_rad:g}) must be more than "
             f"{twist:.4g}, by which the reducer twists at limits.torque_max_Nm"
         )
+    found += _unit_problems(config, reducer)
     if reducer.map is not None:
         found += _map_problems(config, reducer.map)
     if not _is_flexible(config):
@@ -253,6 +255,31 @@ def _reducer_problems(config: Config) -> list[str]:
 
 def _is_flexible(config: Config) -> bool:
     return config.control.kind == "flexible_joint"
+
+
+def _unit_problems(config: Config, reducer: Reducer) -> list[str]:
+    """What is so far from the rest that it is in another unit: `check` would not see the resonance."""
+    softest, stiffest = reducer.stiffness_Nmprad, max((reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad))
+    loop, second, found = reducer.loop_stiffness_Nmprad, config.joint_encoder, []
+    if loop is not None and loop > ANOTHER_UNIT * stiffest:
+        found.append(
+            f"reducer.loop_stiffness_Nmprad (={loop:g}) must be at most {ANOTHER_UNIT * stiffest:g}, "
+            f"{ANOTHER_UNIT:g} times that of a steady torque: hysteresis doubles it at most"
+        )
+    critical = math.sqrt((loop or softest) * config.joint.inertia_kgm2)  # with the inertia halved it is greatest
+    if reducer.damping_Nmspr > critical:
+        found.append(
+            f"reducer.damping_Nmspr (={reducer.damping_Nmspr:g}) must be at most {critical:.4g}, the critical one of "
+            "two equal masses: reducers have 2 to 6 % of it"
+        )
+    if second is not None and second.stiffness_Nmprad is not None:
+        least, most = softest / ANOTHER_UNIT, stiffest * ANOTHER_UNIT
+        if not least <= second.stiffness_Nmprad <= most:
+            found.append(
+                f"joint_encoder.stiffness_Nmprad (={second.stiffness_Nmprad:g}) must be in [{least:g}..{most:g}]: "
+                f"reducer.stiffness_Nmprad (={softest:g}) is of the same reducer"
+            )
+    return found
 
 
 def _most_twist_rad(config: Config) -> float:

@@ -341,6 +341,10 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
         ({"reducer__knees_Nm": [25.0, 7.0]}, "reducer.knees_Nm (=[25.0, 7.0]) must be at most 2 torques in ascending"),
         ({"reducer__stiffness_beyond_Nmprad": [1e4]}, "reducer.stiffness_beyond_Nmprad (=[10000.0]) must be 2"),
         ({"reducer__stiffness_Nmprad": 3e4}, "reducer.stiffness_beyond_Nmprad (=[26000.0, 31000.0]) must rise from"),
+        ({"reducer__loop_stiffness_Nmprad": 2.6e7}, "reducer.loop_stiffness_Nmprad (=2.6e+07) must be at most 310000"),
+        ({"reducer__damping_Nmspr": 8000.0}, "reducer.damping_Nmspr (=8000) must be at most 233.7, the critical one"),
+        ({"joint_encoder__stiffness_Nmprad": 10.0}, "joint_encoder.stiffness_Nmprad (=10) must be in [1700..310000]"),
+        ({"joint_encoder__stiffness_Nmprad": 1e7}, "joint_encoder.stiffness_Nmprad (=1e+07) must be in [1700..310000]"),
         ({"reducer__map__direction": -1}, "reducer.map.direction (=-1) differs from encoder.direction (=1): the map"),
         ({"reducer__map__zero_counts": 7}, "reducer.map.zero_counts (=7) differs from encoder.zero_counts (=0): the"),
         ({"reducer__map__torque_ripple_Nm": [1.0]}, "reducer.map.torque_ripple_Nm must be as long a list as its"),
@@ -367,6 +371,9 @@ def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], mes
 def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     changes = {"limits__following_error_max_rad": 0.003, "limits__position_max_rad": 0.3535}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    changes = {"reducer__loop_stiffness_Nmprad": 3e5, "joint_encoder__stiffness_Nmprad": 1800.0}
+    load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    load_config(written(tmp_path / "joint.toml", "realistic", reducer__damping_Nmspr=232.0))
     changes = {"reducer__map__kinematic_error_rad": [0.0015, 2e-4], "reducer__map__torque_ripple_Nm": [59.0, -0.9]}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
 
