@@ -50,6 +50,15 @@ def test_what_cannot_be_measured_or_written_is_refused_before_anything_moves(tmp
     with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
         map_verb(load_config(shipped_config("realistic")), output, options=IN_LOCKSTEP, write=True)
 
+    path = written(
+        tmp_path / "link.toml", "realistic", joint_encoder=None, reducer__map=None, encoder__side="joint",
+        encoder__counts_per_turn=2**20, control__kp=209.0, control__kv=12.0, control__observer_radps=29.0,
+        control__velocity_cutoff_Hz=11.0,
+    )  # fmt: skip
+    with pytest.raises(ConfigurationError, match=r"encoder.side \(=joint\) must be motor"):
+        map_verb(load_config(path), output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png")
+    assert not (tmp_path / "map.png").exists()
+
 
 def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_before_anything_was_learned(
     tmp_path: Path,

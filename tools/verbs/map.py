@@ -137,6 +137,12 @@ def map_verb(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
+    if write and config.reducer is not None and config.encoder.side != "motor":
+        raise ConfigurationError(
+            f"{config.path}: --write makes a [reducer.map], which is of the motor's angle: encoder.side "
+            f"(={config.encoder.side}) must be motor",
+            "without --write the ripple is shown",
+        )
     picture = figure or Path(f"{config.path.stem}.map.png")
     require_png(picture, [config.path])
     if not (assume_yes or dry_run or options.lockstep):
