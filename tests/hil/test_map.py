@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.drivers.errors import ConfigurationError, MarginError, MotionFault, UsageError
+from jointctl.tools.analysis.reducer_map import found_map
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.map import MapOptions, config_of_map, map_verb
+from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, map_verb
 from tests.configurations import shipped, written
 
 IN_LOCKSTEP = MapOptions(travel_rad=0.5, lockstep=True)
@@ -49,6 +50,15 @@ def test_what_cannot_be_measured_or_written_is_refused_before_anything_moves(tmp
     with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
         map_verb(load_config(shipped_config("realistic")), output, options=IN_LOCKSTEP, write=True)
 
+    path = written(
+        tmp_path / "link.toml", "realistic", joint_encoder=None, reducer__map=None, encoder__side="joint",
+        encoder__counts_per_turn=2**20, control__kp=209.0, control__kv=12.0, control__observer_radps=29.0,
+        control__velocity_cutoff_Hz=11.0,
+    )  # fmt: skip
+    with pytest.raises(ConfigurationError, match=r"encoder.side \(=joint\) must be motor"):
+        map_verb(load_config(path), output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png")
+    assert not (tmp_path / "map.png").exists()
+
 
 def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_before_anything_was_learned(
     tmp_path: Path,
@@ -69,6 +79,23 @@ def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_befor
         error = run.true_error_rad[run.tracking & (run.log.trajectory_s < 10.0)]
         rms.append(float(np.sqrt(np.mean(error**2))))
     assert rms[1] < 0.8 * rms[0]
+
+
+@pytest.mark.parametrize("kv", [30.0, 40.0])
+def test_bristles_that_follow_a_quick_swing_late_leave_the_ripple_in_its_interval(tmp_path: Path, kv: float) -> None:
+    light = {"joint__inertia_kgm2": 0.82, "reducer__motor_inertia_kgm2": 0.43, "virtual__motor_side_inertia_kgm2": 0.43}
+    config = load_config(
+        written(
+            tmp_path / "light.toml", "realistic", **light, reducer__map=None, control__kp=1.5 * kv**2, control__kv=kv,
+            virtual__bristle_stiffness_Nmprad=4e4,
+        )
+    )  # fmt: skip
+    moving = config_of_map(config, IN_LOCKSTEP)
+    run = LockstepJoint(moving).run()
+    assert not run.fault
+    ripple = found_map(map_run(moving, run.log, 0.0015)).ripple_Nm[9]
+    assert config.virtual is not None
+    assert abs(ripple.amplitude - config.virtual.torque_ripple_Nm[1]) < ripple.amplitude_half < 0.4 * ripple.amplitude
 
 
 @pytest.mark.parametrize(
@@ -101,3 +128,25 @@ def test_the_motion_stays_within_the_limits_and_learns_nothing() -> None:
     assert config.control.learning is None
     assert config.trajectory.target_rad - config.trajectory.start_rad == pytest.approx(0.7)
     assert config.limits.position_min_rad < config.trajectory.start_rad
+
+
+def test_in_simulated_time_the_gate_and_a_dry_run_are_those_of_the_joint(tmp_path: Path) -> None:
+    stiff = load_config(written(tmp_path / "stiff.toml", "realistic", control__kp=3600.0, control__kv=120.0))
+    err = io.StringIO()
+    output = Output(stdout=io.StringIO(), stderr=err)
+    figure = tmp_path / "map.png"
+    with pytest.raises(MarginError, match=r"phase margin \(=23.7 deg\) must be at least 30 deg"):
+        map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure)
+    assert map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure, dry_run=True) == 0
+    assert "dry run: nothing moved" in err.getvalue()
+    assert not figure.exists()
+    assert map_verb(stiff, output, options=IN_LOCKSTEP, figure=figure, allow_low_margin=True) == 0
+    assert figure.exists()
+
+
+def test_the_faults_of_the_virtual_joint_end_a_map_in_simulated_time(tmp_path: Path) -> None:
+    faulty = load_config(
+        written(tmp_path / "faulty.toml", "realistic", virtual__faults=[{"kind": "drive_fault", "at_s": 3.0}])
+    )
+    with pytest.raises(MotionFault, match="no map"):
+        map_verb(faulty, Output(stdout=io.StringIO(), stderr=io.StringIO()), options=IN_LOCKSTEP)

@@ -6,7 +6,8 @@ hysteresis and friction do, the slope what changes slowly.  Where the joint swin
 and the slope of the friction against the speed have taken part of the torque, and the link's inertia has twisted the
 reducer: that is added.  The mean over the turns of both directions is the result.  What friction, hysteresis and
 counts do to one turn they do to the next in much the same way, so that the mean is not known better than one turn: the
-interval of 95 % has the spread of single turns, and that what was added is known to STIFFNESS_ERROR and TORQUE_ERROR.
+interval of 95 % has the spread of single turns, and that what was added is known to the shares STIFFNESS_ERROR,
+INERTIA_ERROR and FRICTION_ERROR.
 
     eps(theta) = sum a_k sin(k n theta + phi_k)    by which the link is ahead of the motor, both as their encoders read
     r(theta)   = sum c_k sin(k n theta + phi_k)    torque that the motor gets besides, positive towards positive angle
@@ -39,7 +40,8 @@ LEAST_TURNS = 4  # of the motor at constant speed, both directions together
 LEAST_ROWS = 8 * HIGHEST  # of a turn: fewer do not tell its sines apart
 LEVEL = 0.95
 STIFFNESS_ERROR = 0.5  # share by which it is known: hysteresis up to doubles it for a swing
-TORQUE_ERROR = 0.15  # the same of inertia and of the slope of the friction
+INERTIA_ERROR = 0.15
+FRICTION_ERROR = 0.8  # of its slope: bristles follow a quick swing with as much less of it, and the later
 _STEADY = 1e-3  # share of the speed by which a row of constant speed may be off
 _LARGEST_SPREAD = 3.0  # amplitudes below this many standard errors are no part of a map
 
@@ -138,15 +140,15 @@ def _sines(angle_rad: np.ndarray, *values: np.ndarray) -> np.ndarray:
     return np.asarray(fitted[2 : 2 + HIGHEST] + 1j * fitted[2 + HIGHEST :])
 
 
-def _waves(parts: np.ndarray, error: float) -> tuple[Wave, ...]:
-    """Mean and interval of complex amplitudes, shape (turns, 2, HIGHEST): what was seen, and what a model added.
+def _waves(parts: np.ndarray, *errors: float) -> tuple[Wave, ...]:
+    """Mean and interval of complex amplitudes, shape (turns, 1 + models, HIGHEST): what was seen, what models added.
 
-    `error`: share by which that may be wrong.
+    `errors`: shares by which each of these may be wrong.
     """
     from scipy.stats import t  # here: only a map waits for it
 
     estimates, count = parts.sum(axis=1), len(parts)
-    doubt = error * np.abs(parts[:, 1].mean(axis=0))
+    doubt = np.hypot.reduce(np.array(errors)[:, None] * np.abs(parts[:, 1:].mean(axis=0)))
     width = float(t.ppf(0.5 + 0.5 * LEVEL, count - 1)) / math.sqrt(count)
     waves = []
     for k, mean in enumerate(estimates.mean(axis=0)):
@@ -198,10 +200,10 @@ def found_map(run: MapRun) -> FoundMap:
         slope = run.friction_Nmspr[0 if direction > 0 else 1]
         friction_Nm = slope * 1j * direction * orders_radps * found[:, 2]
         kinematic.append((found[:, 0], link_Nm / run.stiffness_Nmprad))
-        ripple.append((-found[:, 1], friction_Nm + inertia_Nm))
+        ripple.append((-found[:, 1], inertia_Nm, friction_Nm))
     return FoundMap(
         () if run.link_rad is None else _waves(np.array(kinematic), STIFFNESS_ERROR),
-        _waves(np.array(ripple), TORQUE_ERROR),
+        _waves(np.array(ripple), INERTIA_ERROR, FRICTION_ERROR),
         (counts[0], counts[1]), speed,
     )  # fmt: skip
 

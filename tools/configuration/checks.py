@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 from jointctl.firmware_py.records import KNEES
@@ -13,6 +14,7 @@ OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a distur
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 LARGEST_SHARE = 0.9  # of the friction that may go with the angle
 LARGEST_SLOPE = 0.5  # of the kinematic error against the angle: beyond 1 the link would turn against the motor
+ANOTHER_UNIT = 10.0  # factor between two values of the same thing beyond which one is in another unit
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -49,6 +51,8 @@ def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_rad
     for end, value in ends.items():
         if not limits.position_min_rad <= value <= limits.position_max_rad:
             found.append(f"trajectory: {end} (={value:g} rad) must be in {allowed}, the limits.position_*_rad")
+    if not found:
+        found += _room_problems(config, low_rad, high_rad)
     if not speed_radps <= limits.velocity_max_radps:
         found.append(
             f"trajectory: peak speed (={speed_radps:g} rad/s) must be in [0..{limits.velocity_max_radps:g}], "
@@ -225,8 +229,12 @@ def _reducer_problems(config: Config) -> list[str]:
             f"reducer.stiffness_beyond_Nmprad (={list(beyond)}) must rise from reducer.stiffness_Nmprad "
             f"(={reducer.stiffness_Nmprad:g})"
         )
-    elif _is_flexible(config):
-        found += _room_problems(config, reducer)
+    elif (twist := _most_twist_rad(config)) >= config.limits.following_error_max_rad:
+        found.append(
+            f"limits.following_error_max_rad (={config.limits.following_error_max_rad:g}) must be more than "
+            f"{twist:.4g}, by which the reducer twists at limits.torque_max_Nm"
+        )
+    found += _unit_problems(config, reducer)
     if reducer.map is not None:
         found += _map_problems(config, reducer.map)
     if not _is_flexible(config):
@@ -249,32 +257,56 @@ def _is_flexible(config: Config) -> bool:
     return config.control.kind == "flexible_joint"
 
 
-def _room_problems(config: Config, reducer: Reducer) -> list[str]:
-    """Whether the motor, which is ahead of the link by the twist, stays inside the limits as well (theta_d)."""
-    slopes = (reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad)
-    ends = (0.0, *reducer.knees_Nm, math.inf)
-    limits, torque_Nm = config.limits, config.limits.torque_max_Nm
-    twist = sum(max(min(torque_Nm, ends[i + 1]) - ends[i], 0.0) / slope for i, slope in enumerate(slopes))
-    if reducer.map is not None:
-        twist += sum(map(abs, reducer.map.kinematic_error_rad))
-    found = []
-    if twist >= limits.following_error_max_rad:
+def _unit_problems(config: Config, reducer: Reducer) -> list[str]:
+    """What is so far from the rest that it is in another unit: `check` would not see the resonance."""
+    softest, stiffest = reducer.stiffness_Nmprad, max((reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad))
+    loop, second, found = reducer.loop_stiffness_Nmprad, config.joint_encoder, []
+    if loop is not None and loop > ANOTHER_UNIT * stiffest:
         found.append(
-            f"limits.following_error_max_rad (={limits.following_error_max_rad:g}) must be more than {twist:.4g}, by "
-            "which the reducer twists at limits.torque_max_Nm"
+            f"reducer.loop_stiffness_Nmprad (={loop:g}) must be at most {ANOTHER_UNIT * stiffest:g}, "
+            f"{ANOTHER_UNIT:g} times that of a steady torque: hysteresis doubles it at most"
         )
-    extremes = trajectory_extremes(config.trajectory)
-    if extremes is None or (config.encoder.side == "joint" and config.joint_encoder is None):
-        return found
+    critical = math.sqrt((loop or softest) * config.joint.inertia_kgm2)  # with the inertia halved it is greatest
+    if reducer.damping_Nmspr > critical:
+        found.append(
+            f"reducer.damping_Nmspr (={reducer.damping_Nmspr:g}) must be at most {critical:.4g}, the critical one of "
+            "two equal masses: reducers have 2 to 6 % of it"
+        )
+    if second is not None and second.stiffness_Nmprad is not None:
+        least, most = softest / ANOTHER_UNIT, stiffest * ANOTHER_UNIT
+        if not least <= second.stiffness_Nmprad <= most:
+            found.append(
+                f"joint_encoder.stiffness_Nmprad (={second.stiffness_Nmprad:g}) must be in [{least:g}..{most:g}]: "
+                f"reducer.stiffness_Nmprad (={softest:g}) is of the same reducer"
+            )
+    return found
+
+
+def _most_twist_rad(config: Config) -> float:
+    """By which the motor is ahead of the link at the torque limit, kinematic error included; 0 for a rigid joint."""
+    reducer, torque_Nm = config.reducer, config.limits.torque_max_Nm
+    if reducer is None or not _is_flexible(config):
+        return 0.0
+    slopes = (reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad)
+    parts = itertools.pairwise((0.0, *reducer.knees_Nm, math.inf))
+    twist = sum(max(min(torque_Nm, b) - a, 0.0) / slope for (a, b), slope in zip(parts, slopes, strict=False))
+    return twist + (0.0 if reducer.map is None else sum(map(abs, reducer.map.kinematic_error_rad)))
+
+
+def _room_problems(config: Config, low_rad: float, high_rad: float) -> list[str]:
+    """Whether the motor, which is ahead of the link by the twist, stays inside the limits as well (theta_d)."""
+    limits, twist = config.limits, _most_twist_rad(config)
+    if config.encoder.side == "joint" and config.joint_encoder is None:
+        return []
+    found = []
     for key, needed, enough in (
-        ("position_min_rad", extremes[0] - twist, limits.position_min_rad <= extremes[0] - twist),
-        ("position_max_rad", extremes[1] + twist, limits.position_max_rad >= extremes[1] + twist),
+        ("position_min_rad", low_rad - twist, limits.position_min_rad <= low_rad - twist),
+        ("position_max_rad", high_rad + twist, limits.position_max_rad >= high_rad + twist),
     ):
         if not enough:
-            value = getattr(limits, key)
             found.append(
-                f"limits.{key} (={value:g}) must leave room for the motor, which is ahead of the link by up to "
-                f"{twist:.4g}: {needed:.5g} is reached"
+                f"limits.{key} (={getattr(limits, key):g}) must leave room for the motor, which is ahead of the link "
+                f"by up to {twist:.4g}: {needed:.5g} is reached"
             )
     return found
 

@@ -22,6 +22,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.hil.lockstep import TRUE_WARMTH_degC
+from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from jointctl.tools.lockstep import LockstepJoint
@@ -452,13 +453,12 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
     return result
 
 
-def lockstep_log(config: Config, motion: Motion, consent: Consent) -> Path | None:
+def lockstep_log(config: Config, motion: Motion, consent: Consent, *, allow_low_margin: bool = False) -> Path | None:
     """A run log of the motion on the virtual joint in simulated time; None after a dry run."""
-    joint = _virtual_joint(config)
-    placed = motion.placed(joint.report)
-    consent.show(placed.lines)
-    if consent.dry_run:
+    begun = simulated(config, motion, consent, allow_low_margin=allow_low_margin)
+    if begun is None:
         return None
+    joint, placed = begun
     run = joint.run_as_configured(placed.constants, placed.table)
     if run.fault:
         raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no log")
@@ -471,22 +471,32 @@ def lockstep_log(config: Config, motion: Motion, consent: Consent) -> Path | Non
     return path
 
 
-def _virtual_joint(config: Config) -> LockstepJoint:
+def simulated(
+    config: Config, motion: Motion, consent: Consent, *, allow_low_margin: bool
+) -> tuple[LockstepJoint, Placed] | None:
+    """The virtual joint for simulated time, and the motion that a session would carry out; None after a dry run."""
     if not config.drive.simulated:
         raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
-    return LockstepJoint(config)
-
-
-def sweep_in_lockstep(
-    swept: SweepPass, meter: SweepMeter, consent: Consent, begin: Begin
-) -> tuple[Fault, float] | None:
-    """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
-    config = swept.config
-    joint = _virtual_joint(config)
-    placed = swept.placed(joint.report)
+    joint = LockstepJoint(config)
+    placed = motion.placed(joint.report)
     consent.show(placed.lines)
     if consent.dry_run:
         return None
+    if not joint.report.commands_velocity:  # then the drive closes the loop
+        require_margin(config, allow_low_margin=allow_low_margin)
+    motion.require_start(joint.report.start_position_rad)
+    return joint, placed
+
+
+def sweep_in_lockstep(
+    swept: SweepPass, meter: SweepMeter, consent: Consent, begin: Begin, *, allow_low_margin: bool = False
+) -> tuple[Fault, float] | None:
+    """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
+    config = swept.config
+    begun = simulated(config, swept, consent, allow_low_margin=allow_low_margin)
+    if begun is None:
+        return None
+    joint, placed = begun
     begin(joint.report)
     cycles = (swept.motion.duration_s + float(placed.constants[0].sequence.approach_s)) * config.loop.rate_Hz
     run = joint.run_as_configured(placed.constants, placed.table, max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))

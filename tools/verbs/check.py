@@ -242,9 +242,10 @@ def _table(analysis: LoopCheck) -> Table:
         table.add_row("eigenvalues of P", "{:.3f}  {:.3f}".format(*ideal.p_eigenvalues), "")
         table.add_row("bound (30)", f"{ideal.bound_per_Nm:.4g}", "|x| for 1 Nm that the network cannot represent")
         table.add_row("bound with |P B|", f"{ideal.tight_bound_per_Nm:.4g}", "the same, tighter")
+    pair = f"{ideal.natural_frequency_radps:.1f} rad/s, damping {ideal.damping:.2f}"
     table.add_row(
         "modes, no delay",
-        f"{ideal.natural_frequency_radps:.1f} rad/s, damping {ideal.damping:.2f}",
+        pair if ideal.damping == ideal.damping else "none oscillates",
         "continuous time: the theory's loop, slowest mode " + f"{ideal.slowest_time_constant_s:.3g} s",
     )
     table.add_section()

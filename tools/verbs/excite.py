@@ -70,11 +70,10 @@ def excite(
     save_png(excitation_figure(design, f"{config.path.stem}: motion of {design.motion.duration_s:.0f} s"), picture)
     output.note(f"written: {picture}")
     _show(design, output)
-    how = {"assume_yes": assume_yes or options.lockstep, "dry_run": dry_run}
-    swept = ExcitePass(moving, design)
-    log = _lockstep(moving, swept, output, **how) if options.lockstep else _measured(
-        moving, swept, output, allow_low_margin=allow_low_margin, **how
-    )  # fmt: skip
+    how = {
+        "assume_yes": assume_yes or options.lockstep, "dry_run": dry_run, "allow_low_margin": allow_low_margin,
+    }  # fmt: skip
+    log = (_lockstep if options.lockstep else _measured)(moving, ExcitePass(moving, design), output, **how)
     if isinstance(log, int):
         return log
     found = ExciteResult(str(log), 0.8 * design.slowest_radps, design.condition, design.known, design.untold)
@@ -102,11 +101,11 @@ def _measured(config: Config, motion: Motion, output: Output, *, allow_low_margi
     return result if isinstance(result, int) else result.log_path
 
 
-def _lockstep(config: Config, motion: Motion, output: Output, *, assume_yes: bool, dry_run: bool) -> Path | int:
+def _lockstep(config: Config, motion: Motion, output: Output, *, allow_low_margin: bool, **how: bool) -> Path | int:
     from jointctl.tools.session.plan import TerminalConsent
     from jointctl.tools.sweeping.carry_out import lockstep_log
 
-    log = lockstep_log(config, motion, TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run))
+    log = lockstep_log(config, motion, TerminalConsent(output, **how), allow_low_margin=allow_low_margin)
     if log is None:
         output.note("dry run: nothing moved")
         return 0

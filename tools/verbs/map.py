@@ -137,14 +137,20 @@ def map_verb(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
+    if write and config.reducer is not None and config.encoder.side != "motor":
+        raise ConfigurationError(
+            f"{config.path}: --write makes a [reducer.map], which is of the motor's angle: encoder.side "
+            f"(={config.encoder.side}) must be motor",
+            "without --write the ripple is shown",
+        )
     picture = figure or Path(f"{config.path.stem}.map.png")
     require_png(picture, [config.path])
     if not (assume_yes or dry_run or options.lockstep):
         require_terminal()
     moving = config_of_map(config, options)
-    measured = _lockstep(moving) if options.lockstep else _measured(
-        moving, output, assume_yes=assume_yes, dry_run=dry_run, allow_low_margin=allow_low_margin
-    )  # fmt: skip
+    measured = (_lockstep if options.lockstep else _measured)(
+        moving, output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run, allow_low_margin=allow_low_margin
+    )
     if isinstance(measured, int):
         return measured
     found = found_map(map_run(moving, *measured))
@@ -178,10 +184,17 @@ def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] 
     return result if isinstance(result, int) else (read_run_log(result.log_path).records, _late_s(config))
 
 
-def _lockstep(config: Config) -> tuple[Any, float]:
-    from jointctl.tools.lockstep import LockstepJoint
+def _lockstep(config: Config, output: Output, *, allow_low_margin: bool, **how: bool) -> tuple[Any, float] | int:
+    from jointctl.tools.session.plan import TerminalConsent, configured
+    from jointctl.tools.sweeping.carry_out import simulated
 
-    run = LockstepJoint(config).run()
+    consent = TerminalConsent(output, **how)
+    begun = simulated(config, configured(config), consent, allow_low_margin=allow_low_margin)
+    if begun is None:
+        output.note("dry run: nothing moved")
+        return 0
+    joint, placed = begun
+    run = joint.run_as_configured(placed.constants, placed.table)
     if run.fault:
         raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no map")
     return run.log, _late_s(config)

@@ -185,7 +185,7 @@ class Sweep:
                 self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
 
         if options.lockstep:
-            ended = sweep_in_lockstep(swept, meter, self._consent, begin)
+            ended = sweep_in_lockstep(swept, meter, self._consent, begin, allow_low_margin=options.allow_low_margin)
             if ended is None:
                 return None
             fault, value = ended

@@ -135,6 +135,13 @@ def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop_and_the_
         require_margin(config, 8e-3, allow_low_margin=True)
 
 
+def test_a_loop_without_an_oscillating_mode_is_shown_without_nan() -> None:
+    shown, _, code = run_check(shipped("realistic", control__kp=2400.0, control__kv=100.0))
+    assert code == 9
+    assert re.search(r"modes, no delay +│ none oscillates +│", shown)
+    assert not re.search(r"\bnan\b", shown)
+
+
 def test_json_holds_the_same_numbers() -> None:
     shown, _, code = run_check(shipped("paper", **PAPER_SIMULATION), json=True)
     data = json.loads(shown)

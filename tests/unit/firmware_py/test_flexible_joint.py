@@ -34,7 +34,9 @@ from jointctl.tools import lockstep
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.session.live_changes import new_motion
 from tests.configurations import changed, shipped, written
 
 RATIO = 121.0
@@ -339,6 +341,10 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
         ({"reducer__knees_Nm": [25.0, 7.0]}, "reducer.knees_Nm (=[25.0, 7.0]) must be at most 2 torques in ascending"),
         ({"reducer__stiffness_beyond_Nmprad": [1e4]}, "reducer.stiffness_beyond_Nmprad (=[10000.0]) must be 2"),
         ({"reducer__stiffness_Nmprad": 3e4}, "reducer.stiffness_beyond_Nmprad (=[26000.0, 31000.0]) must rise from"),
+        ({"reducer__loop_stiffness_Nmprad": 2.6e7}, "reducer.loop_stiffness_Nmprad (=2.6e+07) must be at most 310000"),
+        ({"reducer__damping_Nmspr": 8000.0}, "reducer.damping_Nmspr (=8000) must be at most 233.7, the critical one"),
+        ({"joint_encoder__stiffness_Nmprad": 10.0}, "joint_encoder.stiffness_Nmprad (=10) must be in [1700..310000]"),
+        ({"joint_encoder__stiffness_Nmprad": 1e7}, "joint_encoder.stiffness_Nmprad (=1e+07) must be in [1700..310000]"),
         ({"reducer__map__direction": -1}, "reducer.map.direction (=-1) differs from encoder.direction (=1): the map"),
         ({"reducer__map__zero_counts": 7}, "reducer.map.zero_counts (=7) differs from encoder.zero_counts (=0): the"),
         ({"reducer__map__torque_ripple_Nm": [1.0]}, "reducer.map.torque_ripple_Nm must be as long a list as its"),
@@ -365,8 +371,29 @@ def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], mes
 def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     changes = {"limits__following_error_max_rad": 0.003, "limits__position_max_rad": 0.3535}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    changes = {"reducer__loop_stiffness_Nmprad": 3e5, "joint_encoder__stiffness_Nmprad": 1800.0}
+    load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    load_config(written(tmp_path / "joint.toml", "realistic", reducer__damping_Nmspr=232.0))
     changes = {"reducer__map__kinematic_error_rad": [0.0015, 2e-4], "reducer__map__torque_ripple_Nm": [59.0, -0.9]}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+
+
+def test_a_table_and_a_motion_of_a_program_leave_room_for_the_motor_too(tmp_path: Any) -> None:
+    def with_top(top_rad: float) -> Config:
+        rows = [f"{time_s},{top_rad if time_s == 2 else 0.0}" for time_s in range(5)]
+        (tmp_path / "motion.csv").write_text("\n".join(["time_s,position_rad", *rows, ""]))
+        motion = {"kind": "table", "duration_s": 4.0, "file": "motion.csv"}
+        return load_config(written(tmp_path / "joint.toml", "realistic", trajectory=motion))
+
+    words = r"limits.position_max_rad \(=0.7\) must leave room for the motor, .*: 0.70197 is reached"
+    config = with_top(0.6995)
+    with pytest.raises(ConfigurationError, match=words):
+        trajectory_table(config)
+    move = {"kind": "min_jerk", "duration_s": 2.0, "start_rad": 0.0, "target_rad": 0.6995, "move_s": 2.0}
+    with pytest.raises(ConfigurationError, match=words):
+        new_motion(config, np.zeros((1, 5)), move)
+    trajectory_table(with_top(0.697))
+    new_motion(config, np.zeros((1, 5)), move | {"target_rad": 0.697})
 
 
 def adapting() -> tuple[Any, Any]:
