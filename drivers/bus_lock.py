@@ -115,6 +115,7 @@ class BusLock:
         self._server: socket.socket | None = None
         self._number = -1  # of the name that this lock has
         self._thread: threading.Thread | None = None
+        self._process = os.getpid()
         self._name = lock_name(interface, channel) if _has_lock(interface) else ""
         if not self._name:
             return
@@ -151,7 +152,12 @@ class BusLock:
             settle(self._name)
 
     def close(self) -> None:
-        """Leave the bus to others; may be called twice."""
+        """Leave the bus to others; may be called twice.  A process that is forked has nothing of it to leave.
+
+        The socket that it inherits wakes the program's own thread: no stop would reach the program any more.
+        """
+        if os.getpid() != self._process:
+            return
         if self._thread is not None:
             self._woken.send(b"x")
             self._thread.join()

@@ -10,7 +10,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, usual_domain
 
@@ -57,7 +57,11 @@ class Source:
 
 
 def observers(foxglove: bool | str, ros2: bool | int, *, allow_remote: bool) -> RemoteOptions:
-    """Who may look on, as the options of `jointctl run` say it."""
+    """Who may look on, as the options of `jointctl run` say it; `UsageError` for what they cannot be."""
+    if not isinstance(foxglove, (bool, str)):
+        raise UsageError(f"foxglove (={foxglove}) must be True, False or HOST:PORT")
+    if not isinstance(ros2, int):
+        raise UsageError(f"ros2 (={ros2}) must be True, False or the number of a domain")
     at = FOXGLOVE_AT if foxglove is True else foxglove or None
     domain = usual_domain() if ros2 is True else None if ros2 is False else ros2
     return RemoteOptions(at, domain, allow_remote=allow_remote)
@@ -80,7 +84,7 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
         raise ConfigurationError(f"{config.path}: is no file of {_WORDS[kind]}", f"jointctl.{found} moves it")
     joints = (config,) if isinstance(config, Config) else config.joints
     without = [joint.path for joint in joints if joint.virtual is None]
-    own = wanted.virtual or (shipped and not without and not any(wanted.place))
+    own = wanted.virtual or (shipped and not without and set(wanted.place) == {None})
     for joint in joints if own else ():
         require_simulated(joint, "a virtual joint")
     if own and without:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import JointctlError, MotionFault
+from jointctl.drivers.errors import JointctlError, MotionFault, UsageError
 from jointctl.drivers.stop_note import asked
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -36,6 +37,7 @@ from jointctl.tools.session.set_points import load_check
 
 WHO = "the program"
 ENDED, AGAIN = "the run has ended", "begin a new Joint"
+FORKED = "this process was forked from the one that has the joint", "call it there; nothing here reaches it"
 NOT_COMMISSIONED = "the joint is not commissioned", "use it in a `with` block"
 # what takes its time to load, and is needed while the joint waits for its program
 _NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
@@ -118,6 +120,7 @@ class LiveMotor:
         self._error: BaseException | None = None
         self._told = False  # whether the program has got `_error`
         self._began_ns = 0
+        self._process = os.getpid()  # the one that has it
         self.log_paths: tuple[Path, ...] = ()
         self.constants: Any = None
         self.axis: Any = None
@@ -125,6 +128,7 @@ class LiveMotor:
 
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
+        self._process = os.getpid()
         try:
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
@@ -176,6 +180,7 @@ class LiveMotor:
 
     def _raise(self) -> None:
         """What has ended the session, if it has."""
+        self._require_here()
         if self._thread is None or self._thread.is_alive():
             return
         self._told = True
@@ -191,6 +196,11 @@ class LiveMotor:
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", AGAIN)
+
+    def _require_here(self) -> None:
+        """A process that is forked inherits the loop's memory; its calls must neither count nor seem to."""
+        if os.getpid() != self._process:
+            raise UsageError(*FORKED)
 
     def require(self) -> None:
         if self.axis is not None and self.axis["phase"].max() > AxisPhase.TRACKING:
@@ -235,6 +245,7 @@ class LiveMotor:
         return Newest(records, starts_rad, now_ns, int(records[0]["time_ns"]))
 
     def now_ns(self) -> int:
+        self._require_here()
         return time.monotonic_ns()
 
     def wait(self, seconds: float) -> None:
@@ -258,6 +269,7 @@ class LiveMotor:
             raise MotionFault(f"the loop did not take the motion: {refused[0]}")
 
     def stop(self) -> None:
+        self._require_here()
         self._end()
 
     def _end(self) -> None:
@@ -282,6 +294,8 @@ class LiveMotor:
             self._thread.join(seconds)
 
     def close(self) -> None:
+        if os.getpid() != self._process:
+            return
         try:
             self._end()
         finally:

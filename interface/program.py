@@ -308,9 +308,13 @@ def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: in
     `positions_rad`: (n,) of one joint, (n, axes) of an arm.
     """
     from jointctl.firmware_py.trajectory import spline_table
+    from jointctl.tools.configuration.arm import LONGEST_MOVE_s
 
+    given = times_s, positions_rad
     try:
-        times, positions = np.asarray(times_s, np.float64), np.asarray(positions_rad, np.float64)
+        if any(np.asarray(array).dtype.kind in "bcmMSU" for array in given):  # times of a calendar count nanoseconds
+            raise TypeError
+        times, positions = (np.asarray(array, np.float64) for array in given)
     except (TypeError, ValueError):
         raise ConfigurationError("times_s and positions_rad must be arrays of numbers") from None
     wanted = (len(times),) if positions.ndim == 1 and axes == 1 else (len(times), axes) if times.ndim else ()
@@ -329,6 +333,8 @@ def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: in
     if len(late):
         row = int(late[0]) + 1
         raise ConfigurationError(f"times_s[{row}] (={times[row]:g}) must be above the one before ({times[row - 1]:g})")
+    if not times[-1] - times[0] <= LONGEST_MOVE_s:
+        raise ConfigurationError(f"times_s lasts {times[-1] - times[0]:g} s, must be at most {LONGEST_MOVE_s:g} s")
     try:
         return np.stack([spline_table(times - times[0], column) for column in positions.reshape(len(times), -1).T])
     except ValueError as error:

@@ -39,6 +39,13 @@ def file_stems(names: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
     return found
 
 
+def with_ending(path: Path, ending: str) -> Path:
+    """Of the same name with another ending; `DataError` for a path without a name, such as . and /."""
+    if not path.name:
+        raise DataError(f"{path}: is a folder, not a file")
+    return path.with_suffix(ending)
+
+
 def refuse_overwriting(path: Path, inputs: Iterable[Path]) -> None:
     """`DataError` if `path` is one of the files that the command reads; ask before the work is done."""
     if path.resolve() in {other.resolve() for other in inputs}:

@@ -171,6 +171,31 @@ def test_a_program_that_goes_on_without_its_joint_is_not_ended(bench: Any) -> No
     program.end()
 
 
+def test_a_forked_process_neither_moves_nor_ends_it(bench: Any) -> None:
+    body = """
+    import os
+    child = os.fork()
+    if not child:
+        for call in joint.stop, lambda: joint.state, lambda: joint.wait(1.0), lambda: joint.command(0.1):
+            try:
+                call()
+            except jointctl.UsageError as error:
+                say(error)
+        sys.exit(3)  # through the block
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+    joint.move_to(0.15, duration_s=0.5)
+    say("waiting")
+    joint.wait(30.0)
+    """
+    program = started(bench, body).saw("waiting")
+    stopped = bench.run("stop", "joint.toml")
+    assert (stopped.code, "ending process" in stopped.err) == (0, False), stopped
+    ended = program.finished(30.0)
+    assert ended.err.count("was forked from the one that has the joint") == 4
+    assert "by jointctl stop" in ended.err
+    assert bench.disabled()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import split_channel
-from jointctl.drivers.canopen.cia import EVENT_DRIVEN, LAST_SYNCHRONOUS
+from jointctl.drivers.canopen.cia import EVENT_DRIVEN, HIGHEST_NODE, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import (
     CanopenSettings,
     JointEncoderSettings,
@@ -114,7 +114,9 @@ class CanopenSection(DriveSection):
     )
 
     def problems(self, config: Config) -> list[str]:
-        return joint_encoder_problems(config) + canopen_problems(config) + cascade_problems(config)
+        return (
+            node_problems(config) + joint_encoder_problems(config) + canopen_problems(config) + cascade_problems(config)
+        )
 
     def files(self, config: Config) -> tuple[tuple[str, Path], ...]:
         found = (("drive.eds", eds_path(config)), ("joint_encoder.eds", encoder_eds_path(config)))
@@ -127,7 +129,13 @@ class CanopenSection(DriveSection):
         config = config.model_copy(update={"bus": _moved_bus(config.bus, given, environ)})
         if given.node is None:
             return config
-        return config.model_copy(update={"drive": self.model_copy(update={"node": given.node})})
+        node: object = given.node  # of a program it may be anything
+        if not isinstance(node, int) or isinstance(node, bool) or not 1 <= node <= HIGHEST_NODE:
+            raise ConfigurationError(f"command line: node (={node}) must be a whole number in [1..{HIGHEST_NODE}]")
+        config = config.model_copy(update={"drive": self.model_copy(update={"node": node})})
+        if found := node_problems(config):
+            raise ConfigurationProblems([f"command line: {line}" for line in found])
+        return config
 
     def silence_s(self) -> float:
         """See `DriveSection`: it is asked to send as often as we do."""
@@ -321,15 +329,23 @@ def _moved_bus(own: Bus, given: GivenPlace, environ: Mapping[str, str]) -> Bus:
         raise ConfigurationProblems([f"{origin}: {line}" for line in lines]) from None
 
 
+def node_problems(config: Config) -> list[str]:
+    """Drive, encoder and this program are three nodes: else the drive would watch its own heartbeat, not ours."""
+    drive, encoder, found = canopen_section(config), config.joint_encoder, []
+    if drive.node == drive.master_node:
+        found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
+    if encoder is not None and encoder.node is not None and encoder.node in (drive.node, drive.master_node):
+        found.append(f"joint_encoder.node (={encoder.node}) must differ from drive.node and drive.master_node")
+    return found
+
+
 def joint_encoder_problems(config: Config) -> list[str]:
     """[joint_encoder] against the rest."""
-    drive, encoder, found = canopen_section(config), config.joint_encoder, []
+    encoder, found = config.joint_encoder, []
     if encoder is None:
         return []
     if (encoder.source == "node") != (encoder.node is not None):
         found.append('joint_encoder.node must be given with source = "node", and only then')
-    if encoder.node is not None and encoder.node in (drive.node, drive.master_node):
-        found.append(f"joint_encoder.node (={encoder.node}) must differ from drive.node and drive.master_node")
     if encoder.kind == "incremental" and config.encoder.kind == "incremental":
         found.append("joint_encoder.kind and encoder.kind are both incremental: one of them must know its angle")
     if encoder.disagreement_max_rad >= config.limits.following_error_max_rad * 10.0:
@@ -345,8 +361,6 @@ def canopen_problems(config: Config) -> list[str]:
     drive, limits, found = canopen_section(config), config.limits, []
     if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
         found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
-    if drive.node == drive.master_node:
-        found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
     if LAST_SYNCHRONOUS < drive.rpdo_transmission_type < EVENT_DRIVEN:
         kind = drive.rpdo_transmission_type
         found.append(

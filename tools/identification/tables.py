@@ -281,8 +281,8 @@ def _heading(lines: Sequence[tuple[int, str]], mark: str, usual: int) -> tuple[t
     cells = split(lines[0][1], mark)
     if len(lines) == 1:
         return (cells, 1, []) if not _is_row(cells, mark) else (_counted(len(cells)), 0, [])
-    header = None
-    for index, (_, line) in enumerate(lines):
+    header, above = None, _padded(lines, mark, usual)
+    for index, (_, line) in enumerate(lines[above:], above):
         cells = split(line, mark)
         if len(cells) != usual:
             continue
@@ -301,6 +301,18 @@ def _heading(lines: Sequence[tuple[int, str]], mark: str, usual: int) -> tuple[t
         notes.append(f"line {lines[begin][0]} (={lines[begin][1][:60]}): no numbers, such as units: not read")
         begin += 1
     return split(lines[header][1], mark), begin, notes
+
+
+def _padded(lines: Sequence[tuple[int, str]], mark: str, usual: int) -> int:
+    """How many lines above the header are filled up with empty cells, as a spreadsheet does; 0 where none is.
+
+    The header is the first line without an empty cell at its end then, if that is none of values.
+    """
+    for index, (_, line) in enumerate(lines[:_MOST_HEAD]):
+        cells = split(line, mark)
+        if len(cells) == usual and cells[-1]:
+            return 0 if _is_row(cells, mark) else index
+    return 0
 
 
 def _counted(count: int) -> tuple[str, ...]:

@@ -27,11 +27,11 @@ def report(
     """One self-contained page about a run, or about several beside each other."""
     from jointctl.tools.recording.report_page import check_target, page, write_page
     from jointctl.tools.recording.run_log_reader import read_run_log
-    from jointctl.tools.written_file import file_stems
+    from jointctl.tools.written_file import file_stems, with_ending
 
     if not 1 <= len(paths) <= MOST_LOGS:
         raise DataError(f"number of logs (={len(paths)}) must be in [1..{MOST_LOGS}]")
-    target = out if out is not None else paths[0].with_suffix(".html" if len(paths) == 1 else ".comparison.html")
+    target = out or with_ending(paths[0], ".html" if len(paths) == 1 else ".comparison.html")
     check_target(target, paths)
     logs = [read_run_log(path) for path in paths]
     for path, log in zip(paths, logs, strict=True):

@@ -85,11 +85,11 @@ def validate(
     from jointctl.tools.identification.identification import DIRECTIONS
     from jointctl.tools.identification.identification_report import error_table, fit_figure
     from jointctl.tools.identification.plausibility import check_data
-    from jointctl.tools.written_file import replace_file
+    from jointctl.tools.written_file import replace_file, with_ending
 
     path = config_path(path)
-    figure = figure or data_path.with_suffix(".validation.png")
-    require_png(figure, (data_path, data_path.with_suffix(".json"), path))
+    figure = figure or with_ending(data_path, ".validation.png")
+    require_png(figure, (data_path, with_ending(data_path, ".json"), path))
     config = load_config(path)
     if config.friction is None:
         raise ConfigurationError(f"{path}: [friction] is missing: there is nothing to validate", "identify first")

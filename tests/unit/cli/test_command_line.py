@@ -239,6 +239,8 @@ READING = ("scan", "info", "monitor")
         ("run joint.toml -y --ros2-listen tcp/0.0.0.0:7448", {}, 2, ["--ros2-listen goes with --ros2"]),
         ("run joint.toml -y --ros2 --ros2-listen 7448", {}, 2, ["--ros2-listen (=7448) must be an endpoint such as"]),
         ("demo --config joint.toml", {"virtual": None}, 3, ["[virtual]"]),
+        ("report .", {}, 8, [".: is a folder, not a file"]),
+        ("validate joint.toml /", {}, 8, ["/: is a folder, not a file"]),
         ("hil joint.toml", {"drive__eds": "poor.eds"}, 3, ["poor.eds", "describes no object"]),
         *((verb, {}, 3, ["which bus", "-i socketcan -c can0"]) for verb in READING),
         *((f"{verb} -i jointctl -c nobody-here -t 1", {}, 4, ["no virtual bus"]) for verb in READING),

@@ -16,7 +16,7 @@ from jointctl.drivers.elmo.dialogue import motor_fault_text
 from jointctl.drivers.errors import ConfigurationError, MarginError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.margin_gate import require_margin
-from jointctl.tools.configuration.canopen import eds_path
+from jointctl.tools.configuration.canopen import canopen_section, eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.elmo import elmo_section, serial_line_share
@@ -239,6 +239,21 @@ def test_flag_beats_environment_beats_file() -> None:
         ConfigurationError, match=r"command line: bus.bitrate_bitps \(=1\) must be in \[10000..1e\+06\]"
     ):
         moved(config, GivenPlace(bitrate=1), {})
+
+
+@pytest.mark.parametrize(
+    ("node", "words"),
+    [(0, r"node \(=0\) must be"), (128, "in .1..127."), (1.5, "whole number"), (True, "whole number"),
+     (126, "drive.master_node .=126. must differ from drive.node")],
+)  # fmt: skip
+def test_a_node_that_is_given_is_checked_as_one_of_the_file(node: Any, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"command line: .*{words}"):
+        moved(load_config(shipped_config("virtual")), GivenPlace(node=node), {})
+
+
+def test_a_node_that_is_given_is_taken_up_to_the_last_one() -> None:
+    for node in (1, 125, 127):
+        assert canopen_section(moved(load_config(shipped_config("virtual")), GivenPlace(node=node), {})).node == node
 
 
 def test_a_configuration_cannot_be_changed() -> None:

@@ -473,6 +473,20 @@ def test_the_mark_follows_the_lock(channel: str) -> None:
     assert lock.marker_fd is None
 
 
+def test_a_forked_process_leaves_the_lock_to_its_program(channel: str) -> None:
+    """It unwinds the program's `with` block where it ends by an exception, as after `os.fork` and `sys.exit`."""
+    stops: list[bool] = []
+    with BusLock("socketcan", channel, lambda: stops.append(True)) as lock:
+        child = os.fork()
+        if child == 0:
+            lock.close()
+            os._exit(0)
+        os.waitpid(child, 0)
+        with asked(channel, "stop") as holder:
+            assert holder.is_controller
+    assert stops
+
+
 def test_no_descriptor_is_left_behind(channel: str) -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(2):

@@ -51,6 +51,9 @@ STYLES = {
     "a logger's preamble, units below the names, semicolons and decimal commas": (
         "Messung vom 3.4.2021\nAntrieb;HD 25\nAbtastrate;200\n\nt;q;tau\ns;rad;Nm\n", ";", ",",
     ),
+    "a spreadsheet's preamble, filled up with empty cells": (
+        "Messung vom 3.4.2021;;\nAbtastrate;200;\n;;\nt;q;tau\ns;rad;Nm\n", ";", ",",
+    ),
     "tabs with decimal commas": ("t\tq\ttau\n", "\t", ","),
     "spaces with decimal commas": ("t q tau\n", " ", ","),
     "spaces in front and comments": ("# robot 3\n# t q tau\n  t   q  tau\n", "  ", "."),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import jointctl
@@ -165,10 +167,14 @@ def test_a_table_is_followed_twice(joint: Joint) -> None:
         ([0.0, 1.0], [0.0, math.nan], r"positions_rad\[1\]"),
         ([0.0], [0.0], "must both be"),
         ([0.0, 1.0], ["a", "b"], "numbers"),
+        ([0.0, 1.0], ["0.1", "0.1"], "numbers"),
+        (np.array(["2026-11-27", "2026-11-28"], "datetime64[ns]"), [0.1, 0.1], "numbers"),
+        ([0.0, 1.0], np.array([0.1j, 0.1]), "numbers"),
+        ([0.0, 1e13], [0.1, 0.1], "lasts 1e[+]13 s, must be at most 100000 s"),
     ],
 )
 def test_a_table_is_checked_before_it_begins(
-    joint: Joint, times: list[float], positions: list[float], words: str
+    joint: Joint, times: npt.ArrayLike, positions: npt.ArrayLike, words: str
 ) -> None:
     before = joint.state.desired_position_rad
     with pytest.raises(jointctl.ConfigurationError, match=words):
@@ -240,3 +246,16 @@ def test_without_enable_nothing_is_followed() -> None:
         for call in (lambda: joint.move_to(0.1), lambda: joint.command(0.1)):
             with pytest.raises(jointctl.UsageError, match="enable"):
                 call()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"foxglove": 8765}, r"foxglove \(=8765\) must be True, False or HOST:PORT"),
+        ({"ros2": "robot"}, r"ros2 \(=robot\) must be True, False or the number of a domain"),
+        ({"target": 0}, r"node \(=0\) must be a whole number"),
+    ],
+)
+def test_what_is_no_argument_of_a_joint_is_named(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(jointctl.JointctlError, match=words):
+        Joint("virtual", lockstep=True, **given)
