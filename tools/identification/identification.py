@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -221,7 +222,8 @@ def _pooled(rmse: dict[str, float], directions: dict[str, Any]) -> float:
 
 # --- how it is found ---
 
-_BAD_FIT = 0.15  # RMSE over mean friction
+_BAD_FIT, _OTHER_FORM = 0.15, 0.005  # RMSE over mean friction
+_CORRELATED = 3.0  # standard deviations of the correlation between neighbours where there is none
 _EXACT = 1e-6  # of the greatest friction: between errors below nothing measured decides
 
 
@@ -414,7 +416,19 @@ def _fitted(
             warnings.append(
                 f"the model describes the data at {word} velocity badly: RMSE is {share:.0%} of the friction"
             )
+        elif share > _OTHER_FORM and (found := serial_correlation(fit)) * math.sqrt(len(fit.problem.x)) > _CORRELATED:
+            warnings.append(
+                f"the errors at {word} velocity go with the speed (correlation of neighbours {found:.2f}): friction "
+                "has another form than the model, for which alone the intervals hold; look at the picture"
+            )
     return directions
+
+
+def serial_correlation(fit: Fit) -> float:
+    """Of the weighted errors of points that are neighbours in speed, in [-1..1]; 0 where there is nothing to tell."""
+    errors = fit.residual_Nm * np.sqrt(fit.problem.weight)
+    squares = float(errors @ errors)
+    return float(errors[1:] @ errors[:-1]) / squares if squares > 0.0 else 0.0
 
 
 def _best_fit(problem: Problem, swarm: SwarmResult | None, warnings: list[str], word: str) -> tuple[Fit, float, str]:

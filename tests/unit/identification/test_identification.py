@@ -94,6 +94,20 @@ def test_a_bad_fit_is_told(noise_Nm, warned):
     assert any("badly" in w for w in found.warnings) is warned
 
 
+@pytest.mark.parametrize("bends", [False, True])
+@pytest.mark.parametrize("model", ["auto", "coulomb-viscous"])
+def test_friction_of_another_form_than_the_model_is_told(bends, model):
+    u = np.concatenate([np.geomspace(0.005, 0.2, 20), np.linspace(0.25, 3.0, 20)])
+    friction_Nm = 0.08 + 0.05 * np.sqrt(u) if bends else 0.1 + 0.03 * u
+    noise_Nm = np.random.default_rng(4).normal(0.0, 0.0007, (2, len(u)))
+    data = replace(
+        paper_data(0, np.concatenate([-u[::-1], u])),
+        motor_torque_Nm=np.concatenate([-(friction_Nm + noise_Nm[0])[::-1], friction_Nm + noise_Nm[1]]),
+    )
+    found = identify_friction(data, Options(model=model, swarm=QUICK.swarm))
+    assert any("go with the speed" in warning for warning in found.warnings) is bends
+
+
 def test_the_same_seed_gives_the_same_result():
     first, second = (identify_friction(paper_data(2), QUICK).to_dict() for _ in range(2))
     assert first == second
