@@ -227,6 +227,7 @@ def _feed_forward_Nm(constants: AxisConstants, state: AxisState) -> float:
     if constants.velocity_command.feeds_torque == 0 and constants.law.kind != ControllerKind.FLEXIBLE_JOINT:
         return 0.0
     follow_temperature(constants.law, law, False)
+    law.adaptation.resting = 0  # the observer's torque is not sent: there is nothing to hand over
     law_torque_Nm(constants, state, state.ahead, NO_REPETITION)
     law.feedback_torque_Nm = 0.0
     law.observer_torque_Nm = 0.0

@@ -419,7 +419,10 @@ def _comes_to_rest(
     law: LawConstants, state: AdaptationState, held_Nm: float, disturbance_Nm: float, desired_radps: float,
     error_rad: float,
 ) -> bool:  # fmt: skip
-    """Whether the desired motion has rested for longer than it takes to turn back; notes how it was where it ended."""
+    """Whether a motion has ended, for longer than it takes to turn back; notes how it was where it ended.
+
+    Before the first one, what the observer finds is a load.
+    """
     if abs(desired_radps) >= STILL_radps:
         state.resting = 0
         side = 0 if desired_radps > 0.0 else 1
@@ -435,7 +438,7 @@ def _comes_to_rest(
         state.rest_error_rad = max(math.copysign(error_rad, error_rad * held_Nm), 0.0)
     if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
         state.resting += 1
-    return state.resting > TURNING_CYCLES
+    return state.resting > TURNING_CYCLES and state.moved_s[0] + state.moved_s[1] > 0.0
 
 
 @kernel

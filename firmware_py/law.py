@@ -404,6 +404,7 @@ def _learn(constants: LawConstants, state: LawState, where: Repetition, correcti
     record_correction(constants.learning, state.learning, correction_Nm)
     if epoch_before != state.learning.epoch or where.period_s == 0.0:
         add_to_disturbance(constants.observer, state.observer, before_Nm)
+        state.adaptation.rest_disturbance_Nm += before_Nm
         state.observer_torque_Nm = state.observer.disturbance_Nm
     return torque
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,7 +61,7 @@ def observers(foxglove: bool | str, ros2: bool | int, *, allow_remote: bool) -> 
     """Who may look on, as the options of `jointctl run` say it; `UsageError` for what they cannot be."""
     if not isinstance(foxglove, (bool, str)):
         raise UsageError(f"foxglove (={foxglove}) must be True, False or HOST:PORT")
-    if not isinstance(ros2, int):
+    if not isinstance(ros2, Integral):
         raise UsageError(f"ros2 (={ros2}) must be True, False or the number of a domain")
     at = FOXGLOVE_AT if foxglove is True else foxglove or None
     domain = usual_domain() if ros2 is True else None if ros2 is False else ros2

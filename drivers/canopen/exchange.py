@@ -172,7 +172,7 @@ def differs(frame: Frame, sent: Frame) -> bool:
 @kernel
 def _note_others(port: CanopenPort, frame: Frame, own_rpdo: Frame, own_offset: Frame) -> None:
     """Count set-points that this loop has not sent.  The system hands nobody its own frames; one that is repeated to
-    us all the same, by an adapter, is like ours."""
+    us all the same, within the cycle, is like ours."""
     if frame.can_id == port.rpdo_id:
         port.of_others += 1 if differs(frame, own_rpdo) else 0
     elif port.offset_rpdo_id != 0 and frame.can_id == port.offset_rpdo_id:

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config, Learning
+from jointctl.tools.configuration.sections import Trajectory
 from jointctl.tools.experiments.controllers import (
     Controller,
     changed,
@@ -23,6 +25,7 @@ from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.configurations import changed as changed_config
+from tests.configurations import shipped
 
 
 def joint(config: Config, duration_s: float, **virtual: Any) -> Config:
@@ -180,3 +183,17 @@ def test_with_a_soft_reducer_the_encoder_belongs_on_the_motor(side: str, counts:
     assert (made.fault is Fault.NONE) == stable
     if stable:
         assert np.max(np.abs(made.true_error_rad[made.tracking & (made.log.trajectory_s > 1.0)])) < 3e-4
+
+
+def test_where_the_drive_closes_the_loop_the_friction_that_is_fed_forward_stays_at_rest() -> None:
+    """The observer's torque is not sent there: what it would hand over at rest would have no end."""
+    move = {"kind": "min_jerk", "start_rad": -0.2, "target_rad": 0.2, "move_s": 1.0, "duration_s": 6.0}
+    config = shipped(
+        "realistic", drive__mode="csp", drive__cascade=shipped("csp").drive.cascade,
+        trajectory=TypeAdapter(Trajectory).validate_python(move),
+    )  # fmt: skip
+    made = LockstepJoint(config).run()
+    log = made.log[made.tracking]
+    friction_Nm = log.friction_torque_Nm[(log.trajectory_s > 1.05) & (log.trajectory_s < 6.0)]
+    assert np.ptp(friction_Nm) == 0.0
+    assert friction_Nm[0] > 10.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -130,9 +131,9 @@ class CanopenSection(DriveSection):
         if given.node is None:
             return config
         node: object = given.node  # of a program it may be anything
-        if not isinstance(node, int) or isinstance(node, bool) or not 1 <= node <= HIGHEST_NODE:
+        if not isinstance(node, Integral) or isinstance(node, bool) or not 1 <= int(node) <= HIGHEST_NODE:
             raise ConfigurationError(f"command line: node (={node}) must be a whole number in [1..{HIGHEST_NODE}]")
-        config = config.model_copy(update={"drive": self.model_copy(update={"node": node})})
+        config = config.model_copy(update={"drive": self.model_copy(update={"node": int(node)})})
         if found := node_problems(config):
             raise ConfigurationProblems([f"command line: {line}" for line in found])
         return config

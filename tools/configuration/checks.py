@@ -42,8 +42,13 @@ def trajectory_extremes(trajectory: Trajectory) -> tuple[float, float, float] | 
     return min(ends), max(ends), peak
 
 
-def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_radps: float) -> list[str]:
-    """A trajectory against the limits; also called once a table has been read."""
+def extremes_problems(
+    config: Config, low_rad: float, high_rad: float, speed_radps: float, start_rad: float | None = None
+) -> list[str]:
+    """A trajectory against the limits; also called once a table has been read.
+
+    `start_rad`: where the joint stands already, from which it may come back without the room that the motor needs.
+    """
     limits = config.limits
     allowed = f"[{limits.position_min_rad:g}..{limits.position_max_rad:g}]"
     found = []
@@ -52,7 +57,7 @@ def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_rad
         if not limits.position_min_rad <= value <= limits.position_max_rad:
             found.append(f"trajectory: {end} (={value:g} rad) must be in {allowed}, the limits.position_*_rad")
     if not found:
-        found += _room_problems(config, low_rad, high_rad)
+        found += _room_problems(config, low_rad, high_rad, start_rad)
     if not speed_radps <= limits.velocity_max_radps:
         found.append(
             f"trajectory: peak speed (={speed_radps:g} rad/s) must be in [0..{limits.velocity_max_radps:g}], "
@@ -293,17 +298,17 @@ def _most_twist_rad(config: Config) -> float:
     return twist + (0.0 if reducer.map is None else sum(map(abs, reducer.map.kinematic_error_rad)))
 
 
-def _room_problems(config: Config, low_rad: float, high_rad: float) -> list[str]:
+def _room_problems(config: Config, low_rad: float, high_rad: float, start_rad: float | None) -> list[str]:
     """Whether the motor, which is ahead of the link by the twist, stays inside the limits as well (theta_d)."""
     limits, twist = config.limits, _most_twist_rad(config)
     if config.encoder.side == "joint" and config.joint_encoder is None:
         return []
     found = []
-    for key, needed, enough in (
-        ("position_min_rad", low_rad - twist, limits.position_min_rad <= low_rad - twist),
-        ("position_max_rad", high_rad + twist, limits.position_max_rad >= high_rad + twist),
+    for key, end, needed, enough in (
+        ("position_min_rad", low_rad, low_rad - twist, limits.position_min_rad <= low_rad - twist),
+        ("position_max_rad", high_rad, high_rad + twist, limits.position_max_rad >= high_rad + twist),
     ):
-        if not enough:
+        if not enough and end != start_rad:
             found.append(
                 f"limits.{key} (={getattr(limits, key):g}) must leave room for the motor, which is ahead of the link "
                 f"by up to {twist:.4g}: {needed:.5g} is reached"

@@ -111,10 +111,17 @@ def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> 
     return constants, checked_motion(config, record, table)
 
 
+def _start_rad(record: TrajectoryConstants) -> float | None:
+    """Where a move begins, and the joint stands."""
+    moves = record.kind in (TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID)
+    return float(record.start_rad) if moves else None
+
+
 def checked_motion(config: Config, record: TrajectoryConstants, table: np.ndarray) -> str:
     """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
     peak = peak_of(record, table)
-    problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
+    ends = peak.position_min_rad, peak.position_max_rad
+    problems = extremes_problems(config, *ends, peak.velocity_radps, _start_rad(record))
     torque_Nm = config.joint.inertia_kgm2 * peak.acceleration_radps2
     if not torque_Nm <= config.limits.torque_max_Nm:
         problems.append(

@@ -392,6 +392,9 @@ def test_a_table_and_a_motion_of_a_program_leave_room_for_the_motor_too(tmp_path
     move = {"kind": "min_jerk", "duration_s": 2.0, "start_rad": 0.0, "target_rad": 0.6995, "move_s": 2.0}
     with pytest.raises(ConfigurationError, match=words):
         new_motion(config, np.zeros((1, 5)), move)
+    new_motion(
+        config, np.zeros((1, 5)), move | {"start_rad": 0.6995, "target_rad": 0.0}
+    )  # from where it stands already
     trajectory_table(with_top(0.697))
     new_motion(config, np.zeros((1, 5)), move | {"target_rad": 0.697})
 

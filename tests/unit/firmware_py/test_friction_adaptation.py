@@ -156,6 +156,9 @@ def test_at_rest_the_bristles_take_over_what_the_observer_adds_and_no_more_than_
     state = fresh(law)
     fed = adapted_feed_forward_Nm(law, state, 0.0, 0.0)
     disturbance = 2.0  # a load, which stays
+    for k in range(100):  # before the first motion nothing is friction
+        assert take_at_rest(law, state, 0.02 * k, 0.0, 0.0) == 0.0
+    take_at_rest(law, state, disturbance, side * 0.1, 0.0)
     assert take_at_rest(law, state, disturbance, 0.0, 0.0) == 0.0
     for _ in range(1000):
         disturbance += side * 0.005
