@@ -157,7 +157,9 @@ class DeviceOnBus:
     def stop_drive(self) -> str:
         """What `jointctl stop` does, from another end of this bus; the state in words."""
         bus = can.Bus(interface="virtual", channel=self.channel)
-        return stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
+        state = stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
+        self.settle()  # its last frame may be on the way still
+        return state
 
     def drive(
         self,
