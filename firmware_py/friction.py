@@ -454,7 +454,7 @@ def take_at_rest(
     law: LawConstants, state: AdaptationState, disturbance_Nm: float, desired_radps: float, error_rad: float
 ) -> float:
     """What the bristles take over from the observer [Nm]; 0 while the desired motion goes on."""
-    held = _held_Nm(law, state)
+    held = _held_Nm(law, state) if abs(desired_radps) < STILL_radps else 0.0  # else nothing asks for it
     if not _comes_to_rest(law, state, held, disturbance_Nm, desired_radps, error_rad):
         return 0.0
     side, stiffness = 0 if held >= 0.0 else 1, 0.0
