@@ -107,7 +107,8 @@ def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_row
     if c.kind == TrajectoryKind.MIN_JERK:
         return within(c.move_s, 0.0, _LONGEST_s) and within(QUINTIC_PEAK_SPEED * distance, 0.0, top * c.move_s)
     if c.kind == TrajectoryKind.TRAPEZOID:
-        if not (within(c.speed_radps, 0.0, 1e9) and within(c.acceleration_radps2, 0.0, 1e9)):
+        sizes = within(c.speed_radps, 0.0, 1e9) and within(c.acceleration_radps2, 0.0, 1e9)
+        if not (sizes and within(c.rounding_s, 0.0, _LONGEST_s)):
             return False
         if c.speed_radps == 0.0 or c.acceleration_radps2 == 0.0:
             return False

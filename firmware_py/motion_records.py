@@ -43,6 +43,7 @@ class TrajectoryConstants:
     move_s: f8  # MIN_JERK: duration of one move
     speed_radps: f8  # TRAPEZOID
     acceleration_radps2: f8  # TRAPEZOID
+    rounding_s: f8  # TRAPEZOID: over which its acceleration changes
     dwell_s: f8
 
 

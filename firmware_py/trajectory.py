@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import SetPoint
@@ -25,7 +21,7 @@ from jointctl.firmware_py.states import TrajectoryKind
 # The paper's changes are a SINE with a second set of numbers from 82.5 s on, the time running through: 0.35 sin(0.2
 # pi t) to 0.35 sin(0.125 pi (t + 1.5)), and to 0.175 sin(0.2 pi t) + 0.175.  Both happen at a crest: position (0.35
 # rad) and velocity (0) are continuous, the acceleration jumps from -0.1382 rad/s^2 to -0.0540 and to -0.0691 rad/s^2.
-# A TRAPEZOID's acceleration jumps by design.  Nothing here limits jerk or checks limits: `safety` checks the
+# A TRAPEZOID's acceleration jumps unless it is rounded.  Nothing here limits jerk or checks limits: `safety` checks the
 # reference.
 
 
@@ -82,39 +78,65 @@ def trapezoid_times_s(distance_rad: float, speed_radps: float, acceleration_radp
 
 
 @kernel
-def _trapezoid_move(
-    distance_rad: float, acceleration_radps2: float, ramp_s: float, cruise_s: float, t_s: float, reference: Reference
-) -> None:
-    """From 0 to `distance_rad` (either sign) for 0 <= t <= 2 ramp_s + cruise_s."""
+def _trapezoid_at(
+    distance_rad: float, acceleration_radps2: float, ramp_s: float, cruise_s: float, t_s: float
+) -> tuple[float, float, float, float]:
+    """(integral [rad s], position, velocity, acceleration) from 0 to `distance_rad` (either sign), resting there."""
     acceleration = math.copysign(acceleration_radps2, distance_rad)
-    reference.jerk_radps3 = 0.0
-    reference.snap_radps4 = 0.0
     speed = acceleration * ramp_s
-    left_s = 2.0 * ramp_s + cruise_s - t_s
+    whole_s = 2.0 * ramp_s + cruise_s
+    left_s = whole_s - t_s
+    if not t_s > 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    if not left_s > 0.0:
+        return distance_rad * (t_s - 0.5 * whole_s), distance_rad, 0.0, 0.0
     if t_s < ramp_s:
-        reference.position_rad = 0.5 * acceleration * t_s * t_s
-        reference.velocity_radps = acceleration * t_s
-        reference.acceleration_radps2 = acceleration
-    elif left_s > ramp_s:
-        reference.position_rad = speed * (t_s - 0.5 * ramp_s)
-        reference.velocity_radps = speed
-        reference.acceleration_radps2 = 0.0
-    else:
-        reference.position_rad = distance_rad - 0.5 * acceleration * left_s * left_s
-        reference.velocity_radps = acceleration * left_s
-        reference.acceleration_radps2 = -acceleration
+        return acceleration * t_s * t_s * t_s / 6.0, 0.5 * acceleration * t_s * t_s, acceleration * t_s, acceleration
+    if left_s > ramp_s:
+        beyond_s = t_s - 0.5 * ramp_s
+        integral = 0.5 * speed * (beyond_s * beyond_s + ramp_s * ramp_s / 12.0)
+        return integral, speed * beyond_s, speed, 0.0
+    # the end mirrors the beginning
+    integral = distance_rad * (t_s - 0.5 * whole_s) + acceleration * left_s * left_s * left_s / 6.0
+    return integral, distance_rad - 0.5 * acceleration * left_s * left_s, acceleration * left_s, -acceleration
+
+
+@kernel
+def _rounded_trapezoid(
+    c: TrajectoryConstants, distance_rad: float, ramp_s: float, cruise_s: float, t_s: float, reference: Reference
+) -> None:
+    """The mean of the last `rounding_s`: the acceleration changes linearly; no limit is exceeded that was kept."""
+    integral, position, velocity, acceleration = _trapezoid_at(
+        distance_rad, c.acceleration_radps2, ramp_s, cruise_s, t_s
+    )
+    jerk = 0.0
+    if c.rounding_s > 0.0:
+        before = _trapezoid_at(distance_rad, c.acceleration_radps2, ramp_s, cruise_s, t_s - c.rounding_s)
+        jerk = (acceleration - before[3]) / c.rounding_s
+        acceleration = (velocity - before[2]) / c.rounding_s
+        velocity = (position - before[1]) / c.rounding_s
+        position = (integral - before[0]) / c.rounding_s
+    reference.position_rad = position
+    reference.velocity_radps = velocity
+    reference.acceleration_radps2 = acceleration
+    reference.jerk_radps3 = jerk
+    reference.snap_radps4 = 0.0
+
+
+@kernel
+def _move_times_s(c: TrajectoryConstants) -> tuple[float, float, float]:
+    """(whole move, accelerating, constant speed) of MIN_JERK and TRAPEZOID; the last two of a TRAPEZOID, else 0."""
+    if c.kind != TrajectoryKind.TRAPEZOID:
+        return c.move_s, 0.0, 0.0
+    ramp_s, cruise_s = trapezoid_times_s(abs(c.target_rad - c.start_rad), c.speed_radps, c.acceleration_radps2)
+    return 2.0 * ramp_s + cruise_s + c.rounding_s, ramp_s, cruise_s
 
 
 @kernel
 def _point_to_point_at(c: TrajectoryConstants, t_s: float, reference: Reference) -> None:
     """MIN_JERK and TRAPEZOID: start to target, and when repeated rest, back, rest, and so on."""
     distance = c.target_rad - c.start_rad
-    ramp_s = 0.0
-    cruise_s = 0.0
-    move_s = c.move_s
-    if c.kind == TrajectoryKind.TRAPEZOID:
-        ramp_s, cruise_s = trapezoid_times_s(abs(distance), c.speed_radps, c.acceleration_radps2)
-        move_s = 2.0 * ramp_s + cruise_s
+    move_s, ramp_s, cruise_s = _move_times_s(c)
     if not t_s > 0.0 or not move_s > 0.0:
         _rest_at(c.start_rad, reference)
         return
@@ -132,7 +154,7 @@ def _point_to_point_at(c: TrajectoryConstants, t_s: float, reference: Reference)
         _rest_at(to_rad, reference)
         return
     if c.kind == TrajectoryKind.TRAPEZOID:
-        _trapezoid_move(distance, c.acceleration_radps2, ramp_s, cruise_s, t_s, reference)
+        _rounded_trapezoid(c, distance, ramp_s, cruise_s, t_s, reference)
     else:
         _min_jerk_move(distance, move_s, t_s, reference)
     reference.position_rad += from_rad
@@ -163,11 +185,7 @@ def repetition(c: TrajectoryConstants, table: np.ndarray, t_s: float) -> Repetit
             epoch = 1
         period_s = 2.0 * math.pi / abs(omega) if omega != 0.0 else 0.0
     elif c.repeats != 0 and (c.kind == TrajectoryKind.MIN_JERK or c.kind == TrajectoryKind.TRAPEZOID):
-        move_s = c.move_s
-        if c.kind == TrajectoryKind.TRAPEZOID:
-            ramp_s, cruise_s = trapezoid_times_s(abs(c.target_rad - c.start_rad), c.speed_radps, c.acceleration_radps2)
-            move_s = 2.0 * ramp_s + cruise_s
-        period_s = 2.0 * (move_s + c.dwell_s)
+        period_s = 2.0 * (_move_times_s(c)[0] + c.dwell_s)
     elif c.repeats != 0 and c.kind == TrajectoryKind.TABLE and c.table_rows >= 2:
         period_s = table[c.table_rows - 1, 0]
     if not period_s > 0.0:
@@ -316,70 +334,8 @@ def brake_step(reference: Reference, brake_radps2: float, period_s: float) -> No
     reference.snap_radps4 = 0.0
 
 
-# --- A table from points: a CSV file, or places in a program, with a cubic spline through them ---
-# Plain Python, joint side, SI units.  Errors are ValueError with one line that names the file, the row and the value.
-
-
-def _read_text(path: Path) -> str:
-    try:
-        content = read_input(path, LARGEST_TABLE_BYTES)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: byte {error.start} is not UTF-8 text; a CSV file is needed") from None
-    if "\0" in text:
-        raise ValueError(f"{path}: byte {content.index(0)} is zero: a binary file, but a CSV file is needed")
-    if text and not text.endswith("\n"):
-        last = text.count("\n") + 1
-        raise ValueError(
-            f"{path}: row {last} (={text.rsplit(chr(10), 1)[-1][:60]!r}) must end with a line end; cut off?"
-        )
-    return text
-
-
-def _number(path: Path, row: int, name: str, text: str) -> float:
-    try:
-        value = number_from(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{path}: row {row}: {name} (={text.strip()!r}) must be a finite number")
-    return value
-
-
-def _read_points(path: Path, column: str) -> tuple[np.ndarray, np.ndarray]:
-    columns = ("time_s", column)
-    reader = csv.reader(io.StringIO(_read_text(path)))
-    header = [name.strip() for name in next(reader, [])]
-    for name in columns:
-        if header.count(name) != 1:
-            shown = ",".join(header)[:80]
-            raise ValueError(
-                f"{path}: row 1 (={shown!r}) must name the column {name} once; needed: {','.join(columns)}"
-            )
-    at_time, at_position = (header.index(name) for name in columns)
-    times: list[float] = []
-    positions: list[float] = []
-    for fields in reader:
-        row = reader.line_num
-        if not fields:
-            continue
-        if len(fields) != len(header):
-            raise ValueError(
-                f"{path}: row {row} (={','.join(fields)[:60]!r}) must have {len(header)} values, like row 1"
-            )
-        time_s = _number(path, row, "time_s", fields[at_time])
-        if times and time_s <= times[-1]:
-            raise ValueError(
-                f"{path}: row {row}: time_s (={time_s:g}) must be above that of the row before ({times[-1]:g})"
-            )
-        times.append(time_s)
-        positions.append(_number(path, row, column, fields[at_position]))
-    if len(times) < 2:
-        raise ValueError(f"{path}: rows of values (={len(times)}) must be at least 2")
-    return np.array(times), np.array(positions)
+# --- A table from points, with a cubic spline through them ---
+# Plain Python, joint side, SI units.
 
 
 def spline_table(time_s: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
@@ -405,20 +361,6 @@ def eased(share: np.ndarray) -> np.ndarray:
     """0 to 1 with continuous acceleration, and rest outside: the quintic of a move."""
     u = np.clip(share, 0.0, 1.0)
     return np.asarray(u**3 * (10.0 + u * (-15.0 + 6.0 * u)))
-
-
-def table_from_csv(path: str | Path, column: str = "position_rad") -> np.ndarray:
-    """The table of `reference_at` from a CSV file with the columns time_s and `column`; others are ignored.
-
-    A `spline_table` through the points.  Time is shifted so that the first row is 0.  The last line must end with a
-    line end, or a file that was cut off inside its last number would pass unnoticed.  Returns float64 (points, 5).
-    """
-    path = Path(path)
-    time_s, position_rad = _read_points(path, column)
-    try:
-        return spline_table(time_s - time_s[0], position_rad)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def ends_meet(table: np.ndarray) -> bool:

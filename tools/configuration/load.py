@@ -1,8 +1,13 @@
-"""Read and check a TOML configuration: `load_config(path)` gives a frozen `Config` or one line for each problem."""
+"""Read and check what a joint's run needs: its TOML configuration, and a motion from a CSV file.
+
+`load_config(path)` gives a frozen `Config` or one line for each problem.
+"""
 
 from __future__ import annotations
 
+import csv
 import difflib
+import io
 import math
 import os
 import re
@@ -11,16 +16,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import (
     LARGEST_TABLE_BYTES,
     LARGEST_TEXT_BYTES,
+    number_from,
     parse_toml,
     read_input,
     require_input,
 )
+from jointctl.firmware_py.trajectory import spline_table
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, ConfigurationProblems, problem_lines, raise_if
 from jointctl.tools.configuration.drive_section import GivenPlace, completed
 
@@ -221,3 +229,83 @@ def with_units(data: Mapping[str, Any], place: str = "") -> tuple[dict[str, Any]
             found[key] = number
             remarks.append(f"{name}: {echo(key, value, number)}")
     return found, remarks
+
+
+# --- A motion from a CSV file ---
+# Joint side, SI units.  Errors are ValueError with one line that names the file, the row and the value.
+
+
+def _table_text(path: Path) -> str:
+    try:
+        content = read_input(path, LARGEST_TABLE_BYTES)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8 text; a CSV file is needed") from None
+    if "\0" in text:
+        raise ValueError(f"{path}: byte {content.index(0)} is zero: a binary file, but a CSV file is needed")
+    if text and not text.endswith("\n"):
+        last = text.count("\n") + 1
+        raise ValueError(
+            f"{path}: row {last} (={text.rsplit(chr(10), 1)[-1][:60]!r}) must end with a line end; cut off?"
+        )
+    return text
+
+
+def _number(path: Path, row: int, name: str, text: str) -> float:
+    try:
+        value = number_from(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{path}: row {row}: {name} (={text.strip()!r}) must be a finite number")
+    return value
+
+
+def _read_points(path: Path, column: str) -> tuple[np.ndarray, np.ndarray]:
+    columns = ("time_s", column)
+    reader = csv.reader(io.StringIO(_table_text(path)))
+    header = [name.strip() for name in next(reader, [])]
+    for name in columns:
+        if header.count(name) != 1:
+            shown = ",".join(header)[:80]
+            raise ValueError(
+                f"{path}: row 1 (={shown!r}) must name the column {name} once; needed: {','.join(columns)}"
+            )
+    at_time, at_position = (header.index(name) for name in columns)
+    times: list[float] = []
+    positions: list[float] = []
+    for fields in reader:
+        row = reader.line_num
+        if not fields:
+            continue
+        if len(fields) != len(header):
+            raise ValueError(
+                f"{path}: row {row} (={','.join(fields)[:60]!r}) must have {len(header)} values, like row 1"
+            )
+        time_s = _number(path, row, "time_s", fields[at_time])
+        if times and time_s <= times[-1]:
+            raise ValueError(
+                f"{path}: row {row}: time_s (={time_s:g}) must be above that of the row before ({times[-1]:g})"
+            )
+        times.append(time_s)
+        positions.append(_number(path, row, column, fields[at_position]))
+    if len(times) < 2:
+        raise ValueError(f"{path}: rows of values (={len(times)}) must be at least 2")
+    return np.array(times), np.array(positions)
+
+
+def table_from_csv(path: str | Path, column: str = "position_rad") -> np.ndarray:
+    """The table of `reference_at` from a CSV file with the columns time_s and `column`; others are ignored.
+
+    A `spline_table` through the points.  Time is shifted so that the first row is 0.  The last line must end with a
+    line end, or a file that was cut off inside its last number would pass unnoticed.  Returns float64 (points, 5).
+    """
+    path = Path(path)
+    time_s, position_rad = _read_points(path, column)
+    try:
+        return spline_table(time_s - time_s[0], position_rad)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -39,7 +39,7 @@ from jointctl.firmware_py.states import (
     TrajectoryKind,
     ZeroSpeedRule,
 )
-from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
+from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Adaptation, Config, Control, raise_if
 from jointctl.tools.configuration.conversions import (
@@ -49,12 +49,14 @@ from jointctl.tools.configuration.conversions import (
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Hold, Reducer, Section
+from jointctl.tools.configuration.load import table_from_csv
+from jointctl.tools.configuration.sections import Hold, Reducer, Section, Trapezoid
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
 PAPER_CENTRES = (*_PAPER_HALF, 0.0, *(-c for c in _PAPER_HALF))
 APPROACH_MIN_S = 1.0
+ROUNDING_CYCLES = 10  # that the acceleration of a trapezoid with limited jerk changes in, at least
 MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # way of the reference at a standing reading, as a share of the following error that is allowed: without friction
 # feed-forward a healthy joint stands that long before it breaks away
@@ -323,6 +325,19 @@ def fill_trajectory(record: TrajectoryConstants, config: Config, table: np.ndarr
         record.repeats = int(trajectory.repeat)
         ways = {"min_jerk": ("move_s",), "trapezoid": ("speed_radps", "acceleration_radps2")}
         _copy(record, trajectory, "start_rad", "target_rad", "dwell_s", *ways[trajectory.kind])
+        if trajectory.kind == "trapezoid":
+            record.rounding_s = _rounding_s(config, trajectory)
+
+
+def _rounding_s(config: Config, trajectory: Trapezoid) -> float:
+    """Over which its acceleration changes: the heaviest link swings once meanwhile, and so hardly afterwards."""
+    reducer = config.reducer
+    if trajectory.jerk_radps3 != "auto":  # what is sent ahead takes the jerk as lasting
+        return max(trajectory.acceleration_radps2 / trajectory.jerk_radps3, ROUNDING_CYCLES * period_s(config))
+    if reducer is None:
+        return 0.0
+    link_kgm2 = config.margin.payload_range[1] * (config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2)
+    return math.tau * math.sqrt(link_kgm2 / reducer.stiffness_Nmprad)
 
 
 def _cycles(config: Config, time_s: float) -> int:

@@ -471,6 +471,8 @@ class Trapezoid(Section):
     target_rad: Angle  # where it ends
     speed_radps: Annotated[float, between(0.0, 1000.0, open_low=True)]  # on the level part
     acceleration_radps2: Annotated[float, between(0.0, 1e5, open_low=True)]  # also of the deceleration
+    # at most, over ten cycles at least; "auto": the acceleration jumps, with [reducer] over a period of the link on it
+    jerk_radps3: Annotated[float | Literal["auto"], auto_or_number(1e-6, 1e9)] = "auto"
     dwell_s: Annotated[float, between(0.0, 1e5)] = 0.0  # rest at each end
     repeat: bool = False  # back and forth
 

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.firmware_py.trajectory import table_from_csv
 from jointctl.hil.canopen.dictionary import ObjectDictionary
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.load import load_config, table_from_csv
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log

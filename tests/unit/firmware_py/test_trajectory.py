@@ -23,9 +23,9 @@ from jointctl.firmware_py.trajectory import (
     peak_of,
     plan_approach,
     reference_at,
-    table_from_csv,
     trapezoid_times_s,
 )
+from jointctl.tools.configuration.load import table_from_csv
 from tests.python_process import run_python
 
 # Trajectories: the three quantities belong together, joins and ends are as promised, approach and brake are exact.
@@ -168,6 +168,30 @@ def test_trapezoid_within_its_limits_continuous_and_exact_at_the_end(start, targ
     t_s = part * move_s
     if move_s > 0.0 and min(abs(t_s - ramp_s), abs(t_s - ramp_s - cruise_s), t_s, move_s - t_s) > 2e-4 * move_s:
         assert_consistent(lambda t: at(c, t), t_s, 1e-4 * move_s, 1e-6 * (speed + acceleration))
+
+
+@quick
+@given(angle, angle, st.floats(0.1, 3.0), st.floats(0.1, 10.0), st.floats(0.01, 2.0))
+def test_a_rounded_trapezoid_is_the_mean_of_the_sharp_one(start, target, speed, acceleration, rounding_s):
+    """Within the same limits, later at the target by the rounding, with a jerk of twice the acceleration at most."""
+    numbers = {"start_rad": start, "target_rad": target, "speed_radps": speed, "acceleration_radps2": acceleration}
+    sharp = constants(TrajectoryKind.TRAPEZOID, **numbers)
+    round_ = constants(TrajectoryKind.TRAPEZOID, rounding_s=rounding_s, **numbers)
+    ramp_s, cruise_s = trapezoid_times_s(abs(target - start), speed, acceleration)
+    whole_s = 2.0 * ramp_s + cruise_s + rounding_s
+    assert at(round_, whole_s + 1e-9) == (target, 0.0, 0.0)
+    assert at(round_, whole_s - 1e-9) == pytest.approx((target, 0.0, 0.0), abs=1e-6)
+    shares = np.linspace(0.0, 1.0, 101)
+    for t_s in shares[1:] * whole_s:
+        window = sampled(sharp, NO_TABLE, t_s - rounding_s + rounding_s * shares)
+        now = at(round_, t_s)
+        within = acceleration * rounding_s / len(shares)  # what the sum leaves of each of the three
+        assert now[0] == pytest.approx(np.trapezoid(window[:, 0], shares), abs=within * rounding_s + 1e-9)
+        assert now[1] == pytest.approx(np.trapezoid(window[:, 1], shares), abs=within + 1e-9)
+        assert abs(now[1]) <= speed * (1.0 + 1e-9)
+        assert abs(now[2]) <= acceleration * (1.0 + 1e-9)
+        before = at(round_, t_s - 0.01 * rounding_s)
+        assert abs(now[2] - before[2]) <= 0.02 * acceleration + 1e-9
 
 
 @pytest.mark.parametrize("kind", [TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID])
