@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from jointctl.drivers.errors import ConfigurationError, one_line
 from jointctl.joint import state_of
-from jointctl.joint_source import Wanted
-from jointctl.program import Newest, Program, motor_of
+from jointctl.program import Newest, Program, Wanted, motor_of
 from jointctl.tools.session.set_points import finite
 
 if TYPE_CHECKING:

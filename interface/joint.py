@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from jointctl.firmware_py.states import fault_name
-from jointctl.joint_source import Wanted
-from jointctl.program import OFF, PHASES, Motor, Newest, Program, motor_of
+from jointctl.program import OFF, PHASES, Motor, Newest, Program, Wanted, motor_of
 from jointctl.tools.session.session_drive import drive_state_name
 from jointctl.tools.session.set_points import SetPointError, finite
 

@@ -17,8 +17,7 @@ from jointctl.drivers.errors import JointctlError, MotionFault, UsageError
 from jointctl.drivers.stop_note import asked
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.joint_source import Source
-from jointctl.program import POLL_S, TABLE_ROWS, Newest, NewMotion, axes_of
+from jointctl.program import POLL_S, TABLE_ROWS, Newest, NewMotion, Source, axes_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event

@@ -18,7 +18,7 @@ from jointctl.drivers.errors import JointctlError, UsageError
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.states import AxisPhase, StopRequest, TrajectoryKind
-from jointctl.joint_source import observers
+from jointctl.program import observers
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.recording.run_log import INFO, WARNING

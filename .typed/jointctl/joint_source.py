@@ -1,1 +1,0 @@
-../../interface/joint_source.py
