@@ -154,8 +154,9 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
 def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
     """RAMPING: brake the reference, then wait until the joint itself has stood for a while.
 
-    One slow reading is not enough: an oscillating joint has one at every reversal.  One that has stood stays `ready`
-    for the others of its arm until it clearly moves: with a noisy encoder they would never be so in the same cycle.
+    One slow reading is not enough: an oscillating joint has one at every reversal.  One that flickers by a few counts
+    stands, however fast a count reads.  One that has stood stays `ready` for the others of its arm until it clearly
+    moves: with a noisy encoder they would never be so in the same cycle.
     """
     if state.ready != 0 and state.held_back == 0:
         enter(state, AxisPhase.RELEASING)  # as all others do, whatever the readings of this cycle
@@ -163,10 +164,16 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
     for _ in range(elapsed_cycles):
         brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
     speed_radps = abs(state.velocity.velocity_radps)
-    if not speed_radps <= MOVES_AGAIN * constants.limits.standstill_radps:
+    limits = constants.limits
+    settling_s = constants.sequence.settle_cycles * constants.law.period_s
+    flicker_rad = min(limits.frozen_tolerance_rad, limits.standstill_radps * settling_s)  # motion leaves it meanwhile
+    flickers = abs(state.measured_position_rad - state.stood_rad) <= flicker_rad
+    flickers = flickers and speed_radps <= limits.velocity_max_radps
+    if not (flickers or speed_radps <= MOVES_AGAIN * limits.standstill_radps):
         state.ready = 0
-    if not speed_radps <= constants.limits.standstill_radps or state.reference.velocity_radps != 0.0:
+    if not (flickers or speed_radps <= limits.standstill_radps) or state.reference.velocity_radps != 0.0:
         state.still_cycles = 0
+        state.stood_rad = state.measured_position_rad
     elif state.sample_age_cycles == 0:  # a lost sample proves nothing either way
         state.still_cycles += elapsed_cycles
         if state.still_cycles >= constants.sequence.settle_cycles:

@@ -521,7 +521,7 @@ class AxisState:
     ready: i4  # to go on to the next phase, as far as this axis is concerned
     held_back: i4  # by another axis that is not; set before the cycle, 0 for a single joint
     shaken: i4  # 1 while another axis is astray; set before the cycle, 0 for a single joint
-    stood_rad: f8  # when its drive was enabled, from then on without torque, or when its torque began to be released
+    stood_rad: f8  # when its drive was enabled, from then on without torque, or when it came to rest after braking
     good_samples: i8
     sample_count: i8
     gap_cycles: i8  # periods since the sample before this cycle's, 0 where there is no new one

@@ -12,7 +12,6 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MotionFault, UsageError
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import margins
-from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
@@ -138,22 +137,6 @@ def test_a_joint_that_does_not_move_as_it_should_ends_it_in_one_line(
         tune(load_config(path), output, options=TuneOptions(lockstep=True))
     assert "is as it was" in str(raised.value)
     assert path.read_text() == text
-
-
-def test_a_filter_that_reads_a_count_as_motion_raises_what_counts_as_standing(tmp_path: Path) -> None:
-    output, *_ = outputs()
-    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
-    config = changed(load_config(shipped_config("precise")), encoder__counts_per_turn=2**17)
-    job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)
-    quick = config.control.model_copy(update={"velocity_cutoff_Hz": 450.0})
-    slow = config.control.model_copy(update={"velocity_cutoff_Hz": 40.0})
-    of_a_count = velocity_of_a_count_radps(changed(config, control=quick))
-    assert of_a_count > config.limits.standstill_radps
-    assert job._limits_with(quick).standstill_radps == pytest.approx(1.2 * of_a_count, rel=1e-3)
-    assert job._limits_with(slow) == config.limits
-    coarse = changed(config, encoder__counts_per_turn=2**14)
-    limits = Tune(coarse, TuneOptions(lockstep=True), carrier, tmp_path)._limits_with(quick)
-    assert limits.standstill_radps == pytest.approx(0.1 * config.limits.velocity_max_radps)
 
 
 @pytest.mark.parametrize(("frequency_Hz", "kind"), [(0.1, "sine"), (1.0, "min_jerk")])

@@ -14,6 +14,7 @@ from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import (
+    law_resolution_rad,
     static_friction_Nm,
     torque_constant_NmpA,
     velocity_of_a_count_radps,
@@ -169,12 +170,14 @@ def _inertia_contradictions(config: Config) -> list[str]:
 
 def _standstill_contradiction(config: Config) -> list[str]:
     """A reading that flickers by one count."""
-    of_a_count, standstill = velocity_of_a_count_radps(config), config.limits.standstill_radps
-    if of_a_count <= standstill:
+    standstill, settle_s = config.limits.standstill_radps, config.sequence.settle_s
+    of_a_count, count_rad = velocity_of_a_count_radps(config), law_resolution_rad(config)
+    if of_a_count <= standstill or count_rad <= standstill * settle_s:
         return []
     return [
         f"limits.standstill_radps (={standstill:g}) is less than {of_a_count:.3g}, what one count of the encoder reads "
-        f"behind control.velocity_cutoff_Hz (={config.control.velocity_cutoff_Hz:g}): a joint whose reading "
+        f"behind control.velocity_cutoff_Hz (={config.control.velocity_cutoff_Hz:g}), and than "
+        f"{count_rad / settle_s:.3g}, one count in sequence.settle_s (={settle_s:g}): a joint whose reading "
         "flickers is never taken to stand (STOP_TIMEOUT)"
     ]
 

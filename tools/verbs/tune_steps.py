@@ -23,7 +23,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
 from jointctl.tools.configuration.config import Config, Control
-from jointctl.tools.configuration.conversions import period_s, static_friction_Nm, velocity_of_a_count_radps
+from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
 from jointctl.tools.configuration.found_values import (
     Found,
     rounded,
@@ -36,7 +36,7 @@ from jointctl.tools.configuration.found_values import (
 )
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
-from jointctl.tools.configuration.sections import Limits, ReducerMap, Trajectory
+from jointctl.tools.configuration.sections import ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
@@ -80,7 +80,6 @@ SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about t
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
 SWEEP_OBSERVER_radps = 50.0
 SWARM = SwarmSettings(particles=300, iterations=1500)
-STANDS, STANDSTILL_SHARE = 1.2, 0.1  # times what a count reads, and at most that of limits.velocity_max_radps
 VERIFY_FROM_s = 5.0
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
@@ -292,19 +291,12 @@ class Tune:
         return values_of_fit(self.original, self.fit, source)
 
     def _with_control(self, control: Control) -> Config:
-        update: dict[str, Any] = {"control": control, "limits": self._limits_with(control)}
+        update: dict[str, Any] = {"control": control}
         second = self.config.joint_encoder
         if second is not None and self.config.encoder.side == "motor":
             law = "joint_encoder" if control.kind == "flexible_joint" else "encoder"
             update["joint_encoder"] = second.model_copy(update={"law": law})
         return self.config.model_copy(update=update)
-
-    def _limits_with(self, control: Control) -> Limits:
-        """A joint that stands may flip by one count, which a quick filter reads as a speed that is no standstill."""
-        limits = self.original.limits
-        flip_radps = rounded(STANDS * velocity_of_a_count_radps(self.config.model_copy(update={"control": control})))
-        standstill_radps = max(limits.standstill_radps, min(flip_radps, STANDSTILL_SHARE * limits.velocity_max_radps))
-        return self.config.limits.model_copy(update={"standstill_radps": standstill_radps})
 
     def chosen_gains(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
@@ -549,10 +541,6 @@ class Tune:
         second, chosen = self.original.joint_encoder, self.config.joint_encoder
         if second is not None and chosen is not None and second.law != chosen.law:
             values.append(Found(("joint_encoder",), "law", chosen.law, f"{chosen.law}, of the law {gains['law']}"))
-        standstill_radps = self.config.limits.standstill_radps
-        if standstill_radps != self.original.limits.standstill_radps:
-            source = f"{standstill_radps:g}: one count of the encoder reads as {standstill_radps / STANDS:.2g} rad/s"
-            values.append(Found(("limits",), "standstill_radps", standstill_radps, source))
         virtual = self.config.virtual
         if virtual is not None and virtual != self.original.virtual:
             kept = "the virtual joint stays what it was"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from jointctl.tools.analysis.loop_report import contradictions, trajectory_acceleration
-from jointctl.tools.configuration.conversions import static_friction_Nm, velocity_of_a_count_radps
+from jointctl.tools.configuration.conversions import law_resolution_rad, static_friction_Nm, velocity_of_a_count_radps
 from tests.configurations import changed, shipped
 
 VIRTUAL = shipped()
@@ -71,8 +71,12 @@ def test_an_inertia_that_is_the_motors(share: float, warned: bool) -> None:
 
 @pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])
 def test_one_count_of_the_encoder_is_slower_than_standstill(share: float, warned: bool) -> None:
+    """And than one count while it settles, by which a joint that flickers is told from one that moves."""
     standstill = share * velocity_of_a_count_radps(VIRTUAL)
-    assert ("limits.standstill_radps" in lines(limits__standstill_radps=standstill)) is warned
+    short = {"limits__standstill_radps": standstill, "sequence__settle_s": 0.001}
+    assert ("limits.standstill_radps" in lines(**short)) is warned
+    slow = share * law_resolution_rad(VIRTUAL) / VIRTUAL.sequence.settle_s
+    assert ("limits.standstill_radps" in lines(limits__standstill_radps=slow)) is warned
 
 
 @pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])

@@ -332,6 +332,7 @@ def standing(late: int, times: float, steps: int) -> Arm:
     for _ in range(steps):
         arm.state[late].held_back = 1
         arm.state[late].velocity.velocity_radps = times * arm.constants[late].limits.standstill_radps
+        arm.state[late].measured_position_rad += 1e-6  # no flicker
         _brake(arm.constants[late], arm.state[late], 1)
     return arm
 

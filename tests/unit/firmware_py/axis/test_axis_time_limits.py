@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault, Reaction, StopRequest
-from tests.axis_on_stub_joint import NewRig, assert_fault, finish
+from tests.axis_on_stub_joint import NewRig, PERIOD_s, assert_fault, finish
+
+COUNT_rad = 1e-3
 
 
 def test_a_joint_that_is_being_stopped_needs_no_client(rig: NewRig) -> None:
@@ -77,3 +79,27 @@ def test_a_lost_sample_while_the_joint_comes_to_rest_proves_nothing_either_way(r
     assert (run.phase, run.state.still_cycles) == (AxisPhase.RAMPING, counted)
     run.tick()
     assert run.state.still_cycles == counted + 1
+
+
+@pytest.mark.trips(Fault.STOP_TIMEOUT, "(5.0, 0.0)")
+@pytest.mark.stays(Fault.STOP_TIMEOUT, "(2.0, 0.0)")
+@pytest.mark.parametrize(("flicker_counts", "speed"), [(0.0, 0.0), (2.0, 0.0), (5.0, 0.0), (0.0, 1.1)])
+def test_a_joint_stands_whose_reading_flickers_by_some_counts(rig: NewRig, flicker_counts: float, speed: float) -> None:
+    """One count reads as five times `standstill_radps`; a motion of 1.1 times that is none of a joint that stands."""
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.axis.sequence.settle_cycles, run.axis.limits.standstill_radps = 50, 0.1
+    run.axis.limits.frozen_tolerance_rad, run.axis.limits.saturation_max_cycles = 4.0 * COUNT_rad, 1000
+    run.stop = StopRequest.RAMP
+    while run.state.phase != AxisPhase.RAMPING or run.state.reference.velocity_radps != 0.0:
+        run.tick()
+    run.state.still_cycles = cycle = 0
+    rest_rad = run.joint.position_rad
+    while run.phase == AxisPhase.RAMPING:
+        cycle += 1
+        away = cycle % 7 // 4 * flicker_counts * COUNT_rad + cycle * PERIOD_s * speed * run.axis.limits.standstill_radps
+        run.joint.position_rad, run.joint.velocity_radps = rest_rad + away, 0.0
+        run.tick()
+    if flicker_counts > 4.0 or speed > 1.0:
+        assert_fault(run, Fault.STOP_TIMEOUT, Reaction.QUICK_STOP)
+    else:
+        assert (run.phase, run.state.fault) == (AxisPhase.RELEASING, Fault.NONE)
