@@ -536,6 +536,7 @@ class AxisState:
     frozen_at_rad: f8  # that reading
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit
+    fault_slot_ns: i8  # `slot_ns` of its cycle: of several axes the first one's is the cause
     trajectory_s: f8
     slot_ns: i8  # the loop's time of this cycle
     asked_ns: i8  # when the sample of the last cycle was asked for; 0 before the first one

@@ -105,6 +105,7 @@ def latch_fault(state: AxisState, fault: int, value: float, drive_error: int) ->
         state.fault = fault
         state.fault_value = value
         state.fault_drive_error = drive_error
+        state.fault_slot_ns = state.slot_ns
 
 
 @kernel

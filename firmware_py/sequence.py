@@ -32,6 +32,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.fault_drive_error = 0
     state.fault_encoder_error = 0
     state.fault_value = 0.0
+    state.fault_slot_ns = 0
     state.cycle = 0
     state.slot_ns = 0
     state.asked_ns = 0

@@ -148,14 +148,18 @@ class Arm(Program):
 
     def _state(self, newest: Newest) -> ArmState:
         joints = [state_of(newest, self._motor, axis) for axis in range(len(self.names))]
-        faults = (f"{name}: {one.fault}" for name, one in zip(self.names, joints, strict=True) if one.fault)
+        faults = [
+            (int(axis.fault_slot_ns), f"{name}: {one.fault}")
+            for name, one, axis in zip(self.names, joints, self._motor.axis if newest.records else (), strict=False)
+            if one.fault
+        ]
         return ArmState(
             position_rad=np.array([one.position_rad for one in joints]),
             velocity_radps=np.array([one.velocity_radps for one in joints]),
             torque_Nm=np.array([one.torque_Nm for one in joints]),
             desired_position_rad=np.array([one.desired_position_rad for one in joints]),
             phase=newest.phase,
-            fault=next(faults, ""),
+            fault=min(faults, default=(0, ""))[1],
             drive_state=tuple(one.drive_state for one in joints),
             age_s=newest.age_s,
             time_s=newest.now_ns * 1e-9,

@@ -16,7 +16,7 @@ import numpy as np
 from jointctl.drivers.errors import JointctlError, MotionFault, UsageError
 from jointctl.drivers.stop_note import asked
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.states import AxisPhase
 from jointctl.program import POLL_S, TABLE_ROWS, Newest, NewMotion, Source, axes_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -188,10 +188,8 @@ class LiveMotor:
             raise error.with_traceback(None)
         if error is not None and not isinstance(error, KeyboardInterrupt):
             raise error
-        for joint in () if result is None else result.joints:
-            if joint.fault_text is not None:
-                named, text = f"{joint.name}: " if joint.name else "", joint.fault_text
-                raise MotionFault(f"{named}{joint.fault.name} ({int(joint.fault)}): {text.happened}", text.advice)
+        if result is not None and result.faulty:
+            raise result.faulty[0].motion_fault()
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", AGAIN)
@@ -302,9 +300,7 @@ class LiveMotor:
         error, result = self._error, self.result
         if self._told:
             return
-        if isinstance(error, JointctlError) or any(
-            joint.fault is not Fault.NONE for joint in (() if result is None else result.joints)
-        ):
+        if isinstance(error, JointctlError) or (result is not None and result.faulty):
             self._raise()
         if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
             raise error

@@ -73,7 +73,8 @@ class LockstepMotor:
             self.require()
 
     def require(self) -> None:
-        for config, name, axis in zip(self.axes.joints, self.axes.names, self.axis, strict=True):
+        joints = zip(self.axes.joints, self.axes.names, self.axis, strict=True)
+        for config, name, axis in sorted(joints, key=lambda joint: int(joint[2].fault_slot_ns)):
             fault = Fault(int(axis.fault))
             if fault is not Fault.NONE:
                 text = self.drive.fault_text(config, fault, float(axis.fault_value), int(axis.fault_drive_error))

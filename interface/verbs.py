@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, UsageError
 
 if TYPE_CHECKING:
     from jointctl.tools.analysis.reducer_map import FoundMap
@@ -155,9 +155,8 @@ def _raise(verb: str, code: int, result: object) -> None:
         raise KeyboardInterrupt
     if code == DECLINED:
         raise JointctlError(f"{verb}() was declined: nothing moved")
-    fault, text = getattr(result, "fault", None), getattr(result, "fault_text", None)
-    if fault is not None and text is not None:
-        raise MotionFault(f"{fault.name} ({int(fault)}): {text.happened}", text.advice)
+    if faulty := getattr(result, "faulty", None):
+        raise faulty[0].motion_fault()
     raise JointctlError(f"{verb}() ended with exit code {code}")
 
 

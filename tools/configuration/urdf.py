@@ -86,7 +86,7 @@ class UrdfJoint:
     origin: Pose  # of the child's frame in the parent's
     axis: np.ndarray  # unit vector, in the child's frame
     mimics: str | None = None
-    lower_rad: float | None = None
+    lower_rad: float | None = None  # of the limit, and of the soft one where there is one
     upper_rad: float | None = None
     velocity_max_radps: float | None = None
     effort_max_Nm: float | None = None
@@ -173,6 +173,8 @@ class _Reader:
                 if name and count > 1:
                     self._problem(f"{tag} {name} is there {count} times: each must have a name of its own")
         raise_if(self._problems)
+        if robot.find("joint/safety_controller") is not None:
+            self._remarks.append("of <safety_controller> the soft limits are read, k_position and k_velocity are not")
         found = Urdf(self._path, *self._tree(links, joints), tuple(self._remarks))
         raise_if(self._problems)
         return found
@@ -250,23 +252,29 @@ class _Reader:
         largest = LARGEST_LENGTH_m if kind == "prismatic" else LARGEST_TURN_rad
         unit = "millimetres instead of m" if kind == "prismatic" else "degrees instead of rad"
 
-        def given(attribute: str, most: float, why: str) -> float | None:
-            if limit is None or limit.get(attribute) is None:
+        def given(of: ElementTree.Element | None, attribute: str, most: float, why: str) -> float | None:
+            if of is None or of.get(attribute) is None:
                 return None
-            return float(self._numbers(limit, attribute, f"{what}: limit {attribute}", (0.0,), most, why)[0])
+            return float(self._numbers(of, attribute, f"{what}: {of.tag} {attribute}", (0.0,), most, why)[0])
 
-        ranged, before = kind == "revolute", len(self._problems)  # a continuous joint has none
-        low, high = (given(end, largest, unit) if ranged else None for end in ("lower", "upper"))
-        if low is not None and high is not None and not low < high and len(self._problems) == before:
-            self._problem(f"{what}: limit lower (={low:g}) must be below upper (={high:g})")
+        low = high = None
+        if kind == "revolute":  # a continuous joint has no ends
+            before, soft = len(self._problems), self._one(element, "safety_controller", what)
+            lows = [given(limit, "lower", largest, unit), given(soft, "soft_lower_limit", largest, unit)]
+            highs = [given(limit, "upper", largest, unit), given(soft, "soft_upper_limit", largest, unit)]
+            low = max((end for end in lows if end is not None), default=None)
+            high = min((end for end in highs if end is not None), default=None)
+            if low is not None and high is not None and not low < high and len(self._problems) == before:
+                with_soft = "" if soft is None else ", with those of <safety_controller>"
+                self._problem(f"{what}: limit lower (={low:g}) must be below upper (={high:g}){with_soft}")
         return UrdfJoint(
             name=name, kind=kind, parent=self._child(element, "parent", what),
             child=self._child(element, "child", what), origin=self._origin(element, what), axis=axis / length,
             mimics=None if mimic is None else mimic.get("joint", ""),
             lower_rad=low,
             upper_rad=high,
-            velocity_max_radps=given("velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
-            effort_max_Nm=given("effort", 1e6, "Nm"),
+            velocity_max_radps=given(limit, "velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
+            effort_max_Nm=given(limit, "effort", 1e6, "Nm"),
         )  # fmt: skip
 
     def _child(self, element: ElementTree.Element, tag: str, what: str) -> str:
@@ -276,8 +284,11 @@ class _Reader:
             self._problem(f"{what}: {tag} must name a link")
         return link
 
-    def _mass(self, name: str, element: ElementTree.Element, reach_m: float) -> Mass | None:
-        """<inertial> of a link, in the link's frame; farther than `reach_m` from that no arm has its mass."""
+    def _mass(self, name: str, element: ElementTree.Element, reach_m: float, *, fixed: bool) -> Mass | None:
+        """<inertial> of a link, in the link's frame; farther than `reach_m` from that no arm has its mass.
+
+        A `fixed` one may be a mere frame, which some programs write with a mass of 0 or 1e-9 kg.
+        """
         what = f"link {name}"
         before, inertial = len(self._problems), self._one(element, "inertial", what)
         if inertial is None or len(self._problems) > before:
@@ -292,6 +303,8 @@ class _Reader:
         (mass,) = self._numbers(of_mass, "value", f"{what}: mass", (0.0,), LARGEST_MASS_kg, "grams instead of kg")
         if len(self._problems) > before:
             return NO_MASS
+        if fixed and 0.0 <= mass < LEAST_MASS_kg:
+            return None
         if mass < LEAST_MASS_kg:
             self._problem(f"{what}: mass (={mass:g}) must be at least {LEAST_MASS_kg:g} kg")
             return NO_MASS
@@ -361,7 +374,10 @@ class _Reader:
             elif joint.mimics == joint.name:
                 self._problem(f"joint {joint.name}: <mimic> (={joint.mimics}) must name another joint")
         reach_m = max(LEAST_REACH_m, sum(float(np.linalg.norm(joint.origin.offset_m)) for joint in order))
-        masses = {name: self._mass(name, element, reach_m) for name, element in links.items()}
+        masses = {
+            name: self._mass(name, element, reach_m, fixed=name not in above or above[name].kind == "fixed")
+            for name, element in links.items()
+        }
         return roots[0], masses, tuple(order)
 
 

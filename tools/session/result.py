@@ -91,11 +91,25 @@ class RunResult:
     report: CommissioningReport
     name: str = ""  # of the joint, where it is one of several
     others: tuple[RunResult, ...] = ()  # the other joints of an arm
+    fault_slot_ns: int = 0  # the loop's time of the fault
 
     @property
     def joints(self) -> tuple[RunResult, ...]:
         """One result for each joint."""
         return (self, *self.others)
+
+    @property
+    def faulty(self) -> list[RunResult]:
+        """The joints with a fault, the one that had it first before those that its stop has reached."""
+        return sorted((joint for joint in self.joints if joint.fault_text), key=lambda joint: joint.fault_slot_ns)
+
+    def motion_fault(self) -> MotionFault:
+        """The fault of this joint, which must have one."""
+        assert self.fault_text is not None
+        name = f"{self.name}: " if self.name else ""
+        return MotionFault(
+            f"{name}{self.fault.name} ({int(self.fault)}): {self.fault_text.happened}", self.fault_text.advice
+        )
 
 
 # --- What a run says at its end: a fault in words, then the picture beside the log, and the table on stdout ---
@@ -118,12 +132,9 @@ def report_run(result: RunResult, output: Output, config: Config | ArmConfig, mo
     that it is off; both outweigh the `DataError` of a result that cannot be written.
     """
     joints, title = result.joints, run_title(config, motion)
-    faulty = [joint for joint in joints if joint.fault_text is not None]
-    for joint in faulty:
-        text = joint.fault_text
-        assert text is not None
-        name = f"{joint.name}: " if joint.name else ""
-        output.error(f"{name}{joint.fault.name} ({int(joint.fault)}): {text.happened}", text.advice)
+    faulty = [joint.motion_fault() for joint in result.faulty]
+    for fault in faulty:
+        output.error(fault.message, fault.hint)
     wanted = joints if _first(config).log.picture else ()
     drawn = {} if output.for_people else {joint.name: _drawn(joint, output, title) for joint in wanted}
     tables = [_table(joint) for joint in joints]

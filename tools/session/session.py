@@ -374,4 +374,5 @@ class Session:
             log_path=watch.joint.log_path,
             report=report,
             name=watch.joint.name,
+            fault_slot_ns=int(state.fault_slot_ns),
         )

@@ -16,6 +16,7 @@ from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.records import trajectory_table
+from jointctl.tools.configuration.urdf import read_urdf
 from tests.places import CONFIGS
 
 
@@ -188,6 +189,16 @@ IN_URDF: list[tuple[str, str, str]] = [
     ),
     (r'<limit lower="-2.0".*?/>', "", "joint wrist in arm.urdf: <limit> must have lower, upper, velocity, effort"),
     (r'lower="-2.0" ', "", "joint wrist in arm.urdf: <limit> must have lower"),
+    (
+        r'(<limit lower="-2.0".*?/>)',
+        r'\1<safety_controller soft_lower_limit="1" soft_upper_limit="1" k_velocity="0"/>',
+        "joint wrist: limit lower (=1) must be below upper (=1), with those of <safety_controller>",
+    ),
+    (
+        r'(<limit lower="-2.0".*?/>)',
+        r'\1<safety_controller soft_upper_limit="90" k_velocity="0"/>',
+        "joint wrist: safety_controller soft_upper_limit (='90') must be within 12.57; degrees",
+    ),
     (r'velocity="4.2"', 'velocity="0"', "joint wrist in arm.urdf: limit velocity (=0) must be above 0"),
     (r'effort="25"', 'effort="-25"', "joint wrist in arm.urdf: limit effort (=-25) must be above 0"),
     (
@@ -283,6 +294,33 @@ def test_a_urdf_that_cannot_be(folder: Path, pattern: str, text: str, words: str
 def test_a_urdf_just_inside_what_is_allowed(folder: Path, pattern: str, text: str) -> None:
     change(folder / "arm.urdf", pattern, text)
     load_arm(folder / "arm.toml")
+
+
+@pytest.mark.parametrize(
+    ("soft", "allowed"),
+    [
+        ('soft_lower_limit="-1.2" soft_upper_limit="1.9"', (-1.2, 1.9)),
+        ('soft_lower_limit="-9" soft_upper_limit="9"', (-2.0, 2.0)),
+        ('k_position="100"', (-2.0, 2.0)),
+    ],
+)
+def test_soft_limits_narrow_a_joints_range(folder: Path, soft: str, allowed: tuple[float, float]) -> None:
+    change(folder / "arm.urdf", r'(<limit lower="-2.0".*?/>)', rf'\1<safety_controller {soft} k_velocity="40"/>')
+    wrist = read_urdf(folder / "arm.urdf").joints[-1]
+    assert (wrist.lower_rad, wrist.upper_rad) == allowed
+    if allowed[0] > -1.9:
+        assert f"wrist.toml: limits.position_min_rad (=-1.9) must be at least {allowed[0]:g}" in problem(folder)
+    else:
+        assert [line for line in remarks(folder) if "k_position and k_velocity are not" in line]
+
+
+def test_a_frame_that_is_exported_with_a_negligible_mass(folder: Path) -> None:
+    inertial = '<inertial><mass value="1e-9"/><inertia ixx="0" iyy="0" izz="0"/></inertial>'
+    joint = '<joint name="t" type="fixed"><parent link="hand"/><child link="t"/></joint></robot>'
+    change(folder / "arm.urdf", "</robot>", f'<link name="t">{inertial}</link>{joint}')
+    assert read_urdf(folder / "arm.urdf").links["t"] is None
+    change(folder / "arm.urdf", '"1e-9"', '"-1e-9"')
+    assert "link t: mass (=-1e-09) must be at least 1e-06 kg" in problem(folder)
 
 
 def test_a_joint_that_mimics_another_is_named(folder: Path) -> None:

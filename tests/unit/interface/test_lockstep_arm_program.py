@@ -262,6 +262,18 @@ def test_a_fault_of_one_joint_stops_all_and_names_it() -> None:
     assert arm.state.fault.partition(": ")[2] in ("POSITION_LIMIT", "VELOCITY_LIMIT")
 
 
+def test_the_first_of_several_faults_is_the_one_that_is_reported() -> None:
+    arm = jointctl.Arm("virtual", lockstep=True)
+    arm.enable()
+    while not arm.step_torque([40.0, 30.0, 0.0]).fault:
+        pass
+    arm.step(5.0)  # no law brakes the shoulder, which is as fast a little later
+    assert [bool(fault) for fault in arm.records["fault"][-1]] == [True, True, False]
+    assert arm.state.fault == "elbow: VELOCITY_LIMIT"
+    with pytest.raises(jointctl.MotionFault, match=r"^elbow: VELOCITY_LIMIT"):
+        arm.wait(0.1)
+
+
 def test_nothing_enables_twice_and_nothing_moves_after_a_stop(arm: jointctl.Arm) -> None:
     with pytest.raises(jointctl.UsageError, match="a new Arm"):
         arm.enable()

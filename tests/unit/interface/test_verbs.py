@@ -19,6 +19,7 @@ from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.inspection.health import PROBLEM, Finding
 from jointctl.tools.session.fault_words import fault_text
+from jointctl.tools.session.result import RunResult
 from jointctl.tools.verbs.verb_options import ResultOutput
 from tests.places import CONFIGS
 
@@ -115,7 +116,12 @@ def test_what_the_doctor_finds_is_a_result_and_no_failure(monkeypatch: pytest.Mo
 class Ended:
     """As a `RunResult` that a fault has ended."""
 
-    fault, fault_text = Fault.FOLLOWING_ERROR, fault_text(Fault.FOLLOWING_ERROR, 0.1, 0)
+    name, fault, fault_text = "", Fault.FOLLOWING_ERROR, fault_text(Fault.FOLLOWING_ERROR, 0.1, 0)
+    motion_fault = RunResult.motion_fault
+
+    @property
+    def faulty(self) -> list[Ended]:
+        return [self]
 
 
 @pytest.mark.parametrize(

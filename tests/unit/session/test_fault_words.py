@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jointctl import verbs
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import DataError, DeviceError
+from jointctl.drivers.errors import DataError, DeviceError, MotionFault
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState, LogRecord
 from jointctl.firmware_py.schema import new
@@ -354,6 +355,20 @@ def test_what_was_stopped_is_off(tmp_path: Path, joints: int, words: str) -> Non
     found, err = replace(one, others=(one,) * (joints - 1)), io.StringIO()
     assert run_report.report_run(found, Output(stdout=io.StringIO(), stderr=err), WITHOUT_PICTURE) == 130
     assert err.getvalue() == f"stopped by SIGINT; {words}\n"
+
+
+def test_of_several_faults_the_first_one_is_the_cause(tmp_path: Path) -> None:
+    """A drive that is lost costs the others their heartbeat, and they have faults of their own after it."""
+    after = replace(result(tmp_path, Fault.OFF_TIMEOUT), name="shoulder", fault_slot_ns=2)
+    cause = replace(result(tmp_path, Fault.DRIVE_RESTARTED), name="elbow", fault_slot_ns=1)
+    sound = replace(result(tmp_path, Fault.NONE), name="wrist")
+    found, err = replace(after, others=(cause, sound)), io.StringIO()
+    assert run_report.report_run(found, Output(stdout=io.StringIO(), stderr=err), WITHOUT_PICTURE) == 7
+    told = [line.split(" ")[1:3] for line in err.getvalue().splitlines() if line.startswith("error: ")]
+    assert told == [["elbow:", "DRIVE_RESTARTED"], ["shoulder:", "OFF_TIMEOUT"]]
+    for joints in (found, replace(sound, others=(cause,))):
+        with pytest.raises(MotionFault, match=r"^elbow: DRIVE_RESTARTED"):
+            verbs._raise("run", 7, joints)
 
 
 @pytest.mark.parametrize(("fault", "code"), [(Fault.BUS_ERROR, 7), (Fault.NONE, 0)])
