@@ -17,10 +17,11 @@ from typing import Any
 import can
 import canopen
 
-from jointctl.tools.configuration.arm import SHIPPED_ARM
+from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
+from tests.hil import listen_shortly
 from tests.python_process import Finished
 from tests.real_time_joint import real_time_joint
 
@@ -86,7 +87,12 @@ def processes_in(folder: Path) -> list[int]:
 
 
 class Bench:
-    """A folder, a bus of its own name, and `jointctl` as a user types it there."""
+    """A folder, a bus of its own name, and `jointctl` as a user types it there.
+
+    `as_shipped`: it listens to the bus for as long as a user's does, which most tests have no use for.
+    """
+
+    as_shipped = False
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -117,6 +123,8 @@ class Bench:
         return folder / "arm.toml"
 
     def start(self, *arguments: str, **options: Any) -> Started:
+        if not self.as_shipped:
+            options = {"script": Path(listen_shortly.__file__), **options}
         self._started.append(Started(self.folder, arguments, **options))
         return self._started[-1]
 
@@ -126,12 +134,17 @@ class Bench:
     def program(self, text: str) -> Started:
         """A program of the user's own, as a file in the folder."""
         script = self.folder / "program.py"
-        script.write_text(text)
+        shortly = f"import {listen_shortly.LISTENER} as of_the_test\nof_the_test.LISTEN_S = {listen_shortly.LISTEN_S}\n"
+        script.write_text(shortly + text)
         return self.start(script=script)
 
     def joint(self, config: str) -> None:
         """The virtual joint in this process, for tests that need one and no more."""
         self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
+
+    def arm_joints(self, path: Path) -> None:
+        """Those of an arm, likewise."""
+        self._joints.enter_context(real_time_joint(load_arm(path)))
 
     def joint_process(self, config: str) -> Started:
         """`jointctl hil`, ready for others."""

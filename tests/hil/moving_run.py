@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +76,10 @@ def gone(pid: int, timeout_s: float = 10.0) -> bool:
 class Moving:
     """A joint in motion under `jointctl run`, with an onlooker; `loop` is the process id of the compiled loop."""
 
-    def __init__(self, bench: Any, **changes: Any) -> None:
+    def __init__(self, bench: Any, start_joint: Callable[[str], Any] | None = None) -> None:
         self.bench = bench
-        self.config = bench.config(
-            trajectory__duration_s=60.0, sequence__supervisor_timeout_s=0.8, **changes
-        )  # fmt: skip
-        self.hil = bench.joint_process(self.config)
+        self.config = bench.config(trajectory__duration_s=60.0, sequence__supervisor_timeout_s=0.8)
+        self.joint = (start_joint or bench.joint)(self.config)
         self.witness = Witness(bench)
         try:
             self.run = bench.start("run", self.config, "-y").saw("  tracking")

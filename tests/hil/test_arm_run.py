@@ -8,8 +8,6 @@ import re
 import signal
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +25,15 @@ OFF = (State.SWITCH_ON_DISABLED, State.FAULT)
 
 
 class ArmBench:
-    """The shipped arm's files on a bus of the test's own, and its virtual drives."""
+    """The shipped arm's files on a bus of the test's own, `more` at the end of each joint's, and its virtual drives."""
 
-    def __init__(self, bench: Any) -> None:
+    def __init__(self, bench: Any, more: str = "") -> None:
         self.bench, path = bench, bench.arm()
         self.path, self.folder = str(path), path.parent
-        self.drives = bench.start("hil", self.path).saw("virtual arm: nodes 1, 2, 3")
+        for name in NAMES:
+            with (self.folder / f"{name}.toml").open("a") as file:
+                file.write(more)
+        bench.arm_joints(path)
 
     def tracking(self) -> Any:
         """A run that tracks by now."""
@@ -80,22 +81,9 @@ class ArmBench:
         return [read_run_log(max(self.bench.folder.glob(f"runs/*.{name}.mcap"))) for name in NAMES]
 
 
-@contextmanager
-def arm_bench(bench: Any, more: str = "") -> Iterator[ArmBench]:
-    """With the drives running; `more` goes to the end of each joint's file."""
-    made = ArmBench(bench)
-    for name in NAMES:
-        with (made.folder / f"{name}.toml").open("a") as file:
-            file.write(more)
-    yield made
-    made.drives.signal(signal.SIGTERM)
-    made.drives.finished(30.0)
-
-
 @pytest.fixture
-def arm(bench: Any) -> Iterator[ArmBench]:
-    with arm_bench(bench) as made:
-        yield made
+def arm(bench: Any) -> ArmBench:
+    return ArmBench(bench)
 
 
 def test_demo_moves_three_joints_and_leaves_a_log_of_each(bench: Any) -> None:

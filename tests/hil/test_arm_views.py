@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from jointctl.firmware_py.states import AxisPhase, Fault
 from tests.browser import PROGRAM, Browser
 from tests.foxglove_client import FoxgloveClient, free_port
-from tests.hil.test_arm_run import NAMES, ArmBench, arm_bench
+from tests.hil.test_arm_run import NAMES, ArmBench
 from tests.hil.test_foxglove import decoded
 from tests.hil.test_python_arm import PATIENT
 from tests.hil.test_scope_browser import environment, moves, printed_address, state_is
@@ -27,9 +26,8 @@ START_rad = 0.1  # virtual.initial_position_rad of all
 
 
 @pytest.fixture
-def arm(bench: Any) -> Iterator[ArmBench]:
-    with arm_bench(bench, PATIENT) as made:
-        yield made
+def arm(bench: Any) -> ArmBench:
+    return ArmBench(bench, PATIENT)
 
 
 def targets(now_s: float) -> list[float]:

@@ -67,7 +67,7 @@ def test_states_records_and_events_as_they_stand_in_the_log(bench: Any) -> None:
     run = Run(bench)
     with run.client() as client:
         client.subscribe("/joint_states", "/joint", "/events")
-        client.until(lambda: sum(name == "/joint" for name, _, _ in client.messages) > 600, 60.0)
+        client.until(lambda: sum(name == "/joint" for name, _, _ in client.messages) > 200, 60.0)
         found = list(client.messages)
         assert client.call("/joint/stop") == {"success": True, "message": "STOP taken; again: quick stop"}
         client.until(lambda: any("asked for by" in str(body) for _, _, body in client.messages))

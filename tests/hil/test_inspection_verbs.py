@@ -17,7 +17,7 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_a_run_goes_on_beside_monitor_info_and_scan(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=12.0)
+    config = bench.config(trajectory__duration_s=60.0)
     bench.joint(config)
     monitor = bench.start("monitor", config, "--json").saw("listening on")
     run = bench.start("run", config, "-y").saw("tracking")
@@ -30,14 +30,15 @@ def test_a_run_goes_on_beside_monitor_info_and_scan(bench: Any) -> None:
     found = json.loads(scan.out)
     assert found["controller_active"] is True
     assert {node["node"]: node["nmt_state"] for node in found["nodes"]}[1] == "operational"
+    run.signal(signal.SIGINT)
     ended = run.finished()
-    assert ended.code == 0, ended.err
+    assert ended.code == 130, ended.err
     monitor.signal(signal.SIGINT)
     heard = monitor.finished(20.0)
     assert heard.code == 0, heard.err
     records = bench.log().records
     assert (records.fault == 0).all()
-    assert (records.phase == AxisPhase.TRACKING).sum() > 5000
+    assert (records.phase == AxisPhase.TRACKING).sum() > 1000
     traffic = lines(heard.out)
     kinds = {line["kind"] for line in traffic}
     assert {"nmt", "sync", "pdo", "sdo", "heartbeat"} <= kinds

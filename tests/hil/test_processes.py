@@ -85,9 +85,9 @@ def test_loop_that_hangs_is_ended_and_the_drive_has_stopped(moving: Any) -> None
 
 
 def test_joint_gone_the_run_ends_with_one_line(bench: Any) -> None:
-    moving = Moving(bench)
+    moving = Moving(bench, bench.joint_process)
     moving.close()  # its client would fail with the bus
-    moving.hil.signal(signal.SIGKILL)
+    moving.joint.signal(signal.SIGKILL)
     started = time.monotonic()
     done = moving.run.finished(30.0)
     assert time.monotonic() - started < 25.0

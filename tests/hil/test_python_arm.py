@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault, Notice
 from jointctl.tools.recording.run_log_reader import read_run_log
-from tests.hil.test_arm_run import NAMES, ArmBench, arm_bench
+from tests.hil.bench import processes_in
+from tests.hil.test_arm_run import NAMES, ArmBench
 from tests.hil.test_python_joint import KERNELS, RAMPED
 
 PROGRAM = """
@@ -44,9 +44,8 @@ PATIENT = "\n[stream]\ndelay_s = 0.3\ntimeout_s = 1.0\nclient_timeout_s = 3.0\n"
 
 
 @pytest.fixture
-def arm(bench: Any) -> Iterator[ArmBench]:
-    with arm_bench(bench, PATIENT) as made:
-        yield made
+def arm(bench: Any) -> ArmBench:
+    return ArmBench(bench, PATIENT)
 
 
 def ramped(log: Any) -> bool:
@@ -102,7 +101,7 @@ def test_motions_and_set_points_then_all_off(arm: ArmBench) -> None:
     [
         ("arm.move_to([0.2, 0.1, 0.1]); raise ValueError('mine')", "ValueError: mine"),
         ("arm.stop(); arm.move_to([0.2, 0.1, 0.1])", "the run has ended, by the program"),
-        ("time.sleep(8.0)", "CLIENT_SILENT"),
+        ("time.sleep(5.0)", "CLIENT_SILENT"),
         ("arm.command([0.1, 5.0, 0.1])", "elbow: position_rad (=5) must be in ["),
     ],
 )
@@ -132,7 +131,9 @@ def test_the_death_of_the_interpreter_ramps_all_down(arm: ArmBench) -> None:
     while len(tails := list(arm.bench.folder.glob("runs/*.tail.mcap"))) < len(NAMES):
         assert time.monotonic() < give_up_s
         time.sleep(0.1)
-    time.sleep(1.0)
+    while processes_in(arm.bench.folder):  # the loop, which writes them
+        assert time.monotonic() < give_up_s
+        time.sleep(0.05)
     assert {path.name.split(".", 1)[1] for path in tails} == {f"{name}.tail.mcap" for name in NAMES}
     for path in tails:
         records = read_run_log(path).records

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault
+from tests.hil.bench import processes_in
 
 PROGRAM = """
 import math, sys, time
@@ -93,7 +94,7 @@ def test_motions_and_set_points_then_off(bench: Any) -> None:
     [
         ("joint.move_to(0.2); raise ValueError('mine')", "ValueError: mine"),
         ("joint.stop(); joint.move_to(0.2)", "the run has ended, by the program; the joint is off"),
-        ("time.sleep(8.0)", "CLIENT_SILENT"),
+        ("time.sleep(5.0)", "CLIENT_SILENT"),
         ("joint.command(5.0)", "position_rad (=5) must be in [-0.7..0.7]"),
     ],
 )
@@ -137,7 +138,9 @@ def test_the_death_of_the_interpreter_ramps_down(bench: Any, number: int) -> Non
     while not list(bench.folder.glob("runs/*.tail.mcap")):
         assert time.monotonic() < give_up_s
         time.sleep(0.1)
-    time.sleep(1.0)
+    while processes_in(bench.folder):  # the loop, which writes it
+        assert time.monotonic() < give_up_s
+        time.sleep(0.05)
     log = bench.log()
     assert log.records.fault[-1] == Fault.SUPERVISOR_LOST
     assert log.records.phase[-1] == AxisPhase.FINISHED

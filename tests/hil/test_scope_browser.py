@@ -47,8 +47,11 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
         yield browser
 
 
+STATE = "document.querySelector('[data-testid=\"state\"]').innerText"
+
+
 def state_is(tab: Tab, words: str, timeout_s: float = 90.0) -> None:
-    tab.until(f"document.querySelector('[data-testid=\"state\"]').innerText.includes('{words}')", timeout_s)
+    tab.until(f"{STATE}.includes('{words}')", timeout_s)
 
 
 def environment() -> dict[str, str]:
@@ -92,13 +95,13 @@ def printed_address(scope: Any) -> str:
 def start(tab: Tab) -> None:
     """Tick and press; once more if a busy computer has cut the page off, which then begins with an empty box."""
     give_up = time.monotonic() + 120.0
+    disabled = "document.querySelector('[data-testid=\"start\"]').disabled"
     while "ready" in tab.text("state"):
         assert time.monotonic() < give_up, tab.text("state")
-        if tab.js("document.querySelector('[data-testid=\"start\"]').disabled"):
-            tab.click("clear")
-        else:
-            tab.click("start")
-        time.sleep(2.0)
+        cleared = not tab.js(disabled)
+        tab.click("start" if cleared else "clear")
+        with contextlib.suppress(AssertionError):
+            tab.until(f"!{STATE}.includes('ready')" if cleared else f"!{disabled}", 2.0)
     state_is(tab, "tracking")
 
 
@@ -390,7 +393,7 @@ def test_what_is_chosen_between_two_runs_is_for_the_next_one(bench: Any, browser
     _, tab, _ = opened(bench, browser)
     start(tab)
     moves(tab)
-    time.sleep(9.0)  # through the angle's zero crossing, and half a span further
+    time.sleep(6.0)  # half a span after the angle's zero crossing, with which it begins
     tab.click("stop")
     state_is(tab, "the run has ended")
     tab.click("prepare")

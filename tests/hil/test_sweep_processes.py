@@ -23,7 +23,7 @@ SWEEP = (
 def joint(bench: Any) -> Any:
     """The bench with the joint of sweep_virtual running; limits for a busy computer."""
     bench.config(base="sweep_virtual", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5,
-                 drive__heartbeat_s=1.0)  # fmt: skip
+                 drive__heartbeat_s=0.5)  # fmt: skip
     bench.joint("joint.toml")
     return bench
 

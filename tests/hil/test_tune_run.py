@@ -15,11 +15,20 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 LATE_CYCLES = 5  # far more than the delay that is measured
 
 
+# The least travel that is enough: legs of the response hold two seconds each instead of four, and slow plateaus one
+# period of the motor's ripple.  Without ripple of the friction no plateau is visited twice.
+SHORT = {
+    "limits__position_min_rad": -0.2725, "limits__position_max_rad": 0.2725, "limits__velocity_max_radps": 1.3,
+    "sequence__brake_radps2": 8.0, "virtual__friction_ripple": 0.0, "trajectory__amplitude_rad": 0.1,
+    "trajectory__frequency_Hz": 0.3, "trajectory__duration_s": 3.0,
+}  # fmt: skip
+
+
 @pytest.fixture
 def joint(bench: Any) -> Any:
-    """The bench with the joint of `precise` running; limits for a busy computer."""
-    bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=1.0,
-                 sequence__supervisor_timeout_s=5.0)  # fmt: skip
+    """The bench with a joint as that of `precise` running, whose tune is short; limits for a busy computer."""
+    bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=0.5,
+                 sequence__supervisor_timeout_s=5.0, **SHORT)  # fmt: skip
     bench.joint("joint.toml")
     return bench
 
@@ -73,7 +82,7 @@ def held_up(joint: Any, done: Any) -> bool:
     return "LIMIT_CYCLE" in done.err and int(read_run_log(newest).records.sample_age_cycles[-1000:].max()) > LATE_CYCLES
 
 
-@pytest.mark.slow("eight minutes of motion")
+@pytest.mark.slow("three minutes of motion")
 def test_a_whole_tune_in_real_time(joint: Any) -> None:
     """Its gains are for the delay that was measured: samples that are tens of milliseconds old end it in a limit cycle.
 

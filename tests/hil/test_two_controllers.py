@@ -11,6 +11,7 @@ import can
 import pytest
 
 from jointctl.drivers.canopen.cia import SYNC_ID
+from jointctl.firmware_py.states import Fault
 from tests.hil.terminal import Terminal
 
 SDO_REQUEST = 0x601  # to node 1
@@ -18,13 +19,15 @@ OTHERS = (("run", "-y"), ("clear-fault",), ("doctor", "--motion", "-y"))
 
 
 def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=15.0)
+    config = bench.config(trajectory__duration_s=60.0)
     bench.joint(config)
     first = bench.start("run", config, "-y").saw("  tracking")
     for verb in OTHERS:
         bench.run(*verb, config).refused(4, "another program controls", f"pid {first.process.pid}")
+    first.signal(signal.SIGINT)
     done = first.finished(30.0)
-    assert done.code == 0, done.err
+    assert done.code == 130, done.err
+    assert bench.log().records.fault[-1] == Fault.NONE
     assert bench.disabled()
 
 
@@ -45,6 +48,7 @@ def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
 
 
 def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
+    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     started = [bench.start("run", config, "-y") for _ in range(2)]
@@ -81,6 +85,7 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
 
     After each frame of it, at simulated time: tests/faults/test_every_frame.py.
     """
+    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     run = bench.start("run", config, "-y")
@@ -139,6 +144,7 @@ def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, da
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
+    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
