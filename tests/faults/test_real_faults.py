@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.canopen import network
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
@@ -24,7 +23,6 @@ from jointctl.tools.configuration.sections import FAULT_KINDS
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.virtual_joint import fault_constants
 from tests.configurations import written
-from tests.hil import listen_shortly
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
 from tests.sessions import session_of
@@ -39,9 +37,8 @@ RunWith = Callable[..., RunResult]
 
 
 @pytest.fixture
-def run_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunWith:
+def run_with(tmp_path: Path) -> RunWith:
     """`run_with(kind, duration_s, magnitude)`: one whole run with this fault in [[virtual.faults]]."""
-    monkeypatch.setattr(network, "LISTEN_S", listen_shortly.LISTEN_S)
 
     def run(
         kind: FaultKind, duration_s: float, magnitude: float, tracking_s: float = 1.2, heartbeat_s: float = 0.4

@@ -21,7 +21,6 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
-from tests.hil import listen_shortly
 from tests.python_process import Finished
 from tests.real_time_joint import real_time_joint
 
@@ -87,12 +86,7 @@ def processes_in(folder: Path) -> list[int]:
 
 
 class Bench:
-    """A folder, a bus of its own name, and `jointctl` as a user types it there.
-
-    `as_shipped`: it listens to the bus for as long as a user's does, which most tests have no use for.
-    """
-
-    as_shipped = False
+    """A folder, a bus of its own name, and `jointctl` as a user types it there."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -123,8 +117,6 @@ class Bench:
         return folder / "arm.toml"
 
     def start(self, *arguments: str, **options: Any) -> Started:
-        if not self.as_shipped:
-            options = {"script": Path(listen_shortly.__file__), **options}
         self._started.append(Started(self.folder, arguments, **options))
         return self._started[-1]
 
@@ -134,8 +126,7 @@ class Bench:
     def program(self, text: str) -> Started:
         """A program of the user's own, as a file in the folder."""
         script = self.folder / "program.py"
-        shortly = f"import {listen_shortly.LISTENER} as of_the_test\nof_the_test.LISTEN_S = {listen_shortly.LISTEN_S}\n"
-        script.write_text(shortly + text)
+        script.write_text(text)
         return self.start(script=script)
 
     def joint(self, config: str) -> None:

@@ -120,7 +120,6 @@ def test_a_second_ctrl_c_is_a_quick_stop(bench: Any) -> None:
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.7, 1.5])
 def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
-    bench.as_shipped = True
     config = bench.config(trajectory__duration_s=30.0, sequence__settle_s=5.0, sequence__wait_timeout_s=60.0)
     bench.joint(config)
     started = bench.start("run", config, "-y")

@@ -48,7 +48,6 @@ def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
 
 
 def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
-    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     started = [bench.start("run", config, "-y") for _ in range(2)]
@@ -85,7 +84,6 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
 
     After each frame of it, at simulated time: tests/faults/test_every_frame.py.
     """
-    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     run = bench.start("run", config, "-y")
@@ -144,7 +142,6 @@ def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, da
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
-    bench.as_shipped = True
     config = bench.config()
     bench.joint(config)
     with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
