@@ -7,8 +7,9 @@ delay, encoder), masses and inertias of every link +-10 %, and torque ripple up 
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
 whole model; then all of it again with an observer that is paired and a lead that is that of each joint, with friction
-that the controller knows, which leaves what the arm itself does, and without observer and adaptation, computed torque
-alone.  Of the parts all are run, or those that are named.
+that the controller knows, which leaves what the arm itself does, without observer and adaptation, computed torque
+alone, and with soft reducers of size 25, 20 and 17, two encoders a joint and their law, whose gains are chosen for all
+poses.  Of the parts all are run, or those that are named.
 Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
@@ -21,8 +22,11 @@ from pathlib import Path
 import numpy as np
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
+from jointctl.tools.analysis.arm_check import joint_loop, pose_ranges
+from jointctl.tools.analysis.flexible_gains import chosen_gains
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import Sine
 from jointctl.tools.drawing import BLUE, GREEN, ORANGE, canvas, save_png
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
@@ -35,6 +39,8 @@ RATIOS = (1.0, (1.0 + 5.0**0.5) / 2.0, 5.0**0.5)
 AMPLITUDES_rad = (1.0, 0.7, 0.6)
 OFFSETS_rad = (-0.2, 0.8, 0.0)
 SPEEDS = (0.5, 1.2, 2.2)  # factors on these frequencies
+SOFT_SPEEDS = (0.5, 1.2, 1.8)  # kinematic errors take the joints beyond their limits where the fastest is near them
+SIZES = (25, 20, 17)  # of the flexible reducers
 PAPER_BRISTLE_Nmprad, PAPER_DAMPING_Nmspr = 8e4, 200.0  # of the joint that `jointctl study` draws from
 KINDS = {
     "independent joints": ArmFeedForward.NONE, "gravity only": ArmFeedForward.GRAVITY,
@@ -43,17 +49,19 @@ KINDS = {
 PARTS: dict[str, dict[str, bool]] = {
     "friction as in study": {}, "paired observer": {"paired": True}, "friction as believed": {"known": True},
     "and paired observer": {"known": True, "paired": True}, "without observer": {"observer": False},
+    "flexible joints": {"flexible": True},
 }  # fmt: skip
 
 
 def random_arm(
     arm: ArmConfig, seed: int, index: int, *, known: bool = False, observer: bool = True,
-    paired: bool = False,
+    paired: bool = False, flexible: bool = False,
 ) -> ArmConfig:  # fmt: skip
     """Arm number `index` of the study with this seed.
 
     `known`: its friction is the believed one, without ripples.  Without `observer` the law is computed torque alone.
-    `paired`: the observer is, and the feed-forward leads by each joint's own delay and lag.
+    `paired`: the observer is, and the feed-forward leads by each joint's own delay and lag.  `flexible`: the reducers
+    are soft, and their stiffness is known to 15 %.
     """
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
@@ -74,11 +82,37 @@ def random_arm(
         if paired:
             better = {"observer_paired": True, "feed_forward_lead_s": "auto"}
             config = config.model_copy(update={"control": config.control.model_copy(update=better)})
-        drawn = random_plant(config, ensemble, seed, 100 * index + number)
+        if flexible:
+            drawn = with_reducer(arm, number, ensemble, seed, index)
+        else:
+            drawn = random_plant(config, ensemble, seed, 100 * index + number)
         assert drawn.virtual is not None
         crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
         joints.append(drawn.model_copy(update={"virtual": drawn.virtual.model_copy(update=crest)}))
     return replace(arm, joints=tuple(joints))
+
+
+def with_reducer(arm: ArmConfig, number: int, ensemble: EnsembleSettings, seed: int, index: int) -> Config:
+    """A joint of the arm with a soft reducer, and the gains that are chosen for what is believed of it in all poses."""
+    base, motor_kgm2 = arm.joints[number], float(arm.model.links[number].motor_inertia_kgm2)
+    adaptation = base.control.adaptation
+    control = load_config(shipped_config("realistic")).control.model_copy(update={"adaptation": adaptation})
+    ratio, size = base.joint.inertia_kgm2 / motor_kgm2 - 1.0, SIZES[number]
+    soft = {"flexible": True, "inertia_ratio": (ratio, ratio), "flexible_inertia_scale": (1.0, 1.0)}
+    ensemble = ensemble.model_copy(update=soft | {"reducer_sizes": (size,)})
+    drawn = random_plant(base.model_copy(update={"control": control}), ensemble, seed, 100 * index + number)
+    assert drawn.reducer is not None
+    assert drawn.virtual is not None
+    # the arm's model says what the controller believes of the inertias
+    scale = float(np.random.default_rng([seed, index, number]).uniform(*ensemble.inertia_scale))
+    true = {"motor_side_inertia_kgm2": motor_kgm2 * scale, "inertia_scale": scale}
+    believed = drawn.model_copy(update={
+        "joint": base.joint, "reducer": drawn.reducer.model_copy(update={"motor_inertia_kgm2": motor_kgm2}),
+        "virtual": drawn.virtual.model_copy(update=true),
+    })  # fmt: skip
+    poses = joint_loop(arm.names[number], believed, pose_ranges(arm)[number])
+    gains = chosen_gains(poses.config, poses.settings)
+    return believed.model_copy(update={"control": control.model_copy(update=gains.changes())})
 
 
 def moving(arm: ArmConfig, speed: float) -> ArmConfig:
@@ -116,25 +150,29 @@ def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
     return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
 
 
+def speeds_of(how: dict[str, bool]) -> tuple[float, ...]:
+    return SOFT_SPEEDS if how.get("flexible") else SPEEDS
+
+
 def study(arms: int, seed: int, how: dict[str, bool]) -> np.ndarray:
     """RMSE [mrad], array (speeds, kinds, arms, joints)."""
-    shipped = load_arm(SHIPPED_ARM)
-    found = np.zeros((len(SPEEDS), len(KINDS), arms, len(shipped.joints)))
+    shipped, speeds = load_arm(SHIPPED_ARM), speeds_of(how)
+    found = np.zeros((len(speeds), len(KINDS), arms, len(shipped.joints)))
     for index in range(arms):
         arm = LockstepArm(random_arm(shipped, seed, index, **how))
-        for i, speed in enumerate(SPEEDS):
+        for i, speed in enumerate(speeds):
             for k, kind in enumerate(KINDS.values()):
                 found[i, k, index] = rmse_mrad(run(arm, kind, speed))
     return found
 
 
-def table(found: np.ndarray, names: tuple[str, ...]) -> list[str]:
+def table(found: np.ndarray, names: tuple[str, ...], speeds: tuple[float, ...]) -> list[str]:
     """Lines of a table for docs/arm.md: median and 95 % of the arms, and what the whole model gains."""
     lines = [
         "| speed | joint | independent joints | gravity only | whole model | independent / whole |",
         "|---|---|---|---|---|---|",
     ]
-    for i, speed in enumerate(SPEEDS):
+    for i, speed in enumerate(speeds):
         for joint, name in enumerate(names):
             cells = [
                 f"{np.median(one):.3f} ({np.percentile(one, 95):.3f})"
@@ -169,6 +207,7 @@ if __name__ == "__main__":
         if heading not in (sys.argv[4:] or PARTS):
             continue
         print(f"\n{heading}, {count} arms, seed {chosen}\n")
-        print("\n".join(table(study(count, chosen, how), load_arm(SHIPPED_ARM).names)), flush=True)
+        found = study(count, chosen, how)
+        print("\n".join(table(found, load_arm(SHIPPED_ARM).names, speeds_of(how))), flush=True)
     if len(sys.argv) > 3 and sys.argv[3] != "-":
         picture(Path(sys.argv[3]))

@@ -14,7 +14,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
-from jointctl.tools.analysis.arm_check import joint_loops, require_budgets
+from jointctl.tools.analysis.arm_check import joint_loop, joint_loops, pose_ranges, require_budgets
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 from jointctl.tools.virtual_joint import arm_plant_of
@@ -127,6 +127,23 @@ def test_gravity_helps_every_joint_and_the_whole_model_the_quick_ones_more() -> 
     assert np.all(gravity < 0.95 * independent)
     assert np.all(whole < 0.9 * gravity)
     assert np.all(whole < 0.65 * independent)
+
+
+def test_an_arm_of_flexible_joints_moves_within_its_margins_and_the_model_helps_it() -> None:
+    """Slowly: at higher speed the kinematic error of the reducers is what is left."""
+    shipped = load_arm(SHIPPED_ARM)
+    soft = random_arm(shipped, 1, 0, flexible=True)
+    for name, config, poses in zip(soft.names, soft.joints, pose_ranges(soft), strict=True):
+        assert config.control.kind == "flexible_joint"
+        found = joint_loop(name, config, poses).margins
+        assert found.phase_margin_deg > 30.0
+        assert found.sensitivity_peak < 3.0
+    joints = LockstepArm(soft)
+    independent, whole = (
+        np.array(rmse_mrad(run_study(joints, kind, SPEEDS[0]))) for kind in (ArmFeedForward.NONE, ArmFeedForward.WHOLE)
+    )
+    assert np.all(whole < 0.03)
+    assert np.all(whole < 0.5 * independent)
 
 
 def test_a_run_repeats_bit_by_bit(arm: LockstepArm, whole: list[LockstepRun]) -> None:
