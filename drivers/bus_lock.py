@@ -547,15 +547,25 @@ class StopCall:
 def end_programs(
     calls: Sequence[StopCall], note: Callable[[str], None], ended: Callable[[], None] = lambda: None
 ) -> None:
-    """Of all buses, until no controller is found on any: while one ends, another may come on a bus that was free."""
+    """Of all buses, until no controller is found on any: while one ends, another may come on a bus that was free.
+
+    What holds for several buses, as of the one program that controls an arm, is noted once.
+    """
+    noted: set[str] = set()
+
+    def note_once(text: str) -> None:
+        if text not in noted:
+            noted.add(text)
+            note(text)
+
     for call in calls:
-        call.end(note, ended)
+        call.end(note_once, ended)
     for _ in range(LOOKS):
-        found = [call.again(note, ended) for call in calls]
+        found = [call.again(note_once, ended) for call in calls]
         if not any(found):
             break
     for call in calls:
-        call.clear_away(note)
+        call.clear_away(note_once)
 
 
 def _signalled(pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:

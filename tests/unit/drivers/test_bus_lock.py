@@ -218,6 +218,15 @@ def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
     assert notes == [f"stopping the program that controls the bus (pid {process.pid})"]
 
 
+def test_the_one_program_of_several_buses_is_named_once(channel: str) -> None:
+    notes: list[str] = []
+    with controller(channel) as process:
+        with StopCall("socketcan", channel) as call, StopCall("socketcan", channel) as of_another_bus:
+            end_programs([call, of_another_bus], notes.append)
+        assert process.wait(5.0) == 0
+    assert notes == [f"stopping the program that controls the bus (pid {process.pid})"]
+
+
 @pytest.mark.parametrize("number", [signal.SIGSTOP, None])
 def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | None) -> None:
     notes: list[str] = []
