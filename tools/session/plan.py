@@ -344,13 +344,15 @@ class ConfiguredMotion:
         require_approach(config.limits, axis, self.table, report.start_position_rad)
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
+        rounding_s = float(axis.trajectory.rounding_s)
+        jerk = f", {acceleration / rounding_s:.3g} rad/s3" if rounding_s else ""
         return [
             *joint_lines(report),
             f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
             if approach
             else f"approach   none: at once to {first.position_rad:+.4f} rad",
             f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {speed:.3f} rad/s "
-            f"and {acceleration:.3f} rad/s2, {time_text}",
+            f"and {acceleration:.3f} rad/s2{jerk}, {time_text}",
             limits_line(config.limits),
             *remark_lines(report.remarks),
         ]

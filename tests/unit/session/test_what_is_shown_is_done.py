@@ -50,6 +50,20 @@ def report(start_rad: float = 0.1, **more: Any) -> CommissioningReport:
     return CommissioningReport(DriveIdentity("", "", "", ""), "cyclic_sync_torque", start_rad, 0.06, 1e-5, **more)
 
 
+def test_the_jerk_of_a_rounded_trapezoid_is_shown(tmp_path: Path) -> None:
+    motion = {"kind": "trapezoid", "duration_s": 6.0, "start_rad": 0.0, "target_rad": 0.1, "speed_radps": 0.5}
+
+    def line(**more: float) -> str:
+        chosen: dict[str, Any] = {"trajectory": motion | {"acceleration_radps2": 2.0, **more}}
+        config = load_config(written(tmp_path / "joint.toml", "virtual", **chosen))
+        return next(
+            one for one in resolve(config).motion.envelope(constants_of(config)[0], report()) if "trapezoid" in one
+        )
+
+    assert " rad/s3" not in line()
+    assert "rad/s and 2.000 rad/s2, 40 rad/s3, " in line(jerk_radps3=40.0)
+
+
 # --- no approach ---
 @pytest.mark.parametrize(("start_rad", "refused"), [(0.0, False), (0.005, False), (0.0051, True), (-0.04, True)])
 def test_without_an_approach_the_joint_must_stand_where_the_trajectory_begins(
