@@ -22,10 +22,10 @@ from jointctl.tools.configuration.drive_section import KINDS, DriveSection, sect
 from jointctl.tools.configuration.sections import Rule, Section
 
 UNITS = {
-    "Nm": "Nm", "A": "A", "rad": "rad", "radps": "rad/s", "radps2": "rad/s²", "s": "s", "Hz": "Hz", "Nmps": "Nm/s",
-    "NmpA": "Nm/A", "kgm2": "kg m²", "Nmprad": "Nm/rad", "Nmspr": "Nm s/rad", "bitps": "bit/s", "permille": "‰",
-    "1ps": "1/s", "degC": "°C", "deg": "°", "ps2": "1/s²", "rads": "rad s", "KpA2": "K/A²", "counts": "counts",
-    "cycles": "periods", "kelvin": "1/K",
+    "Nm": "Nm", "A": "A", "rad": "rad", "radps": "rad/s", "radps2": "rad/s²", "radps3": "rad/s³", "s": "s", "Hz": "Hz",
+    "Nmps": "Nm/s", "NmpA": "Nm/A", "kgm2": "kg m²", "Nmprad": "Nm/rad", "Nmspr": "Nm s/rad", "bitps": "bit/s",
+    "permille": "‰", "1ps": "1/s", "degC": "°C", "deg": "°", "ps2": "1/s²", "rads": "rad s", "KpA2": "K/A²",
+    "counts": "counts", "cycles": "periods", "kelvin": "1/K",
 }  # fmt: skip
 TYPES = {float: "number", int: "whole number", str: "text", bool: "true, false"}
 HEAD = """# Configuration reference

@@ -166,7 +166,7 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
     speed_radps = abs(state.velocity.velocity_radps)
     limits = constants.limits
     settling_s = constants.sequence.settle_cycles * constants.law.period_s
-    flicker_rad = min(limits.frozen_tolerance_rad, limits.standstill_radps * settling_s)  # motion leaves it meanwhile
+    flicker_rad = min(limits.frozen_tolerance_rad, limits.standstill_radps * settling_s)  # motion leaves it then
     flickers = abs(state.measured_position_rad - state.stood_rad) <= flicker_rad
     flickers = flickers and speed_radps <= limits.velocity_max_radps
     if not (flickers or speed_radps <= MOVES_AGAIN * limits.standstill_radps):

@@ -165,6 +165,7 @@ _FACTORS: Mapping[str, Mapping[str, float]] = {
         "r/min": _TURN / 60.0, "rev/min": _TURN / 60.0,
     },
     "radps2": {"rad/s2": 1.0, "rad/s^2": 1.0, "rad/s²": 1.0, "deg/s2": _TURN / 360.0, "deg/s^2": _TURN / 360.0},
+    "radps3": {"rad/s3": 1.0, "rad/s^3": 1.0, "rad/s³": 1.0, "deg/s3": _TURN / 360.0, "deg/s^3": _TURN / 360.0},
     "Hz": {"Hz": 1.0, "kHz": 1e3},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0},
     "Nm": {"Nm": 1.0, "mNm": 1e-3, "Ncm": 1e-2, "kNm": 1e3},

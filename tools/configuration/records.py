@@ -330,7 +330,7 @@ def fill_trajectory(record: TrajectoryConstants, config: Config, table: np.ndarr
 
 
 def _rounding_s(config: Config, trajectory: Trapezoid) -> float:
-    """Over which its acceleration changes: the heaviest link swings once meanwhile, and so hardly afterwards."""
+    """Over which its acceleration changes: in one period of the heaviest link, which hardly swings afterwards."""
     reducer = config.reducer
     if trajectory.jerk_radps3 != "auto":  # what is sent ahead takes the jerk as lasting
         return max(trajectory.acceleration_radps2 / trajectory.jerk_radps3, ROUNDING_CYCLES * period_s(config))

@@ -20,6 +20,7 @@ from tests.configurations import VIRTUAL, load, problems
         ("velocity_max_radps", "60 rpm", math.tau),
         ("velocity_max_radps", "6e1 r/min", math.tau),
         ("brake_radps2", "180 deg/s2", math.pi),
+        ("jerk_radps3", "180 deg/s3", math.pi),
         ("rate_Hz", "1 kHz", 1000.0),
         ("rate_Hz", ".5kHz", 500.0),
         ("heartbeat_s", "100 ms", 0.1),
