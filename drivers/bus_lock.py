@@ -6,13 +6,15 @@ controller away only while its loop runs, not at commissioning nor while the use
 The lock is an abstract Unix socket.  The kernel takes it back however the program ends, and it belongs to the network
 namespace, as SocketCAN's interfaces do.  A thread answers on it, in single lines of JSON:
 
-    {"ask": "who"}   ->  {"controls": NAME, "pid": 123}
+    {"ask": "who"}   ->  {"controls": NAME, "pid": 123}       and "starts": true while it looks for others itself
     {"ask": "stop"}  ->  {"controls": NAME, "pid": 123, "within_s": 8.0}   at once, after `on_stop` was called
                          and the connection is closed when the lock is given back
                          {"controls": NAME, "pid": 123, "refused": "..."}  to another user, root excepted
 
 A name proves nothing: who holds it without that answer keeps no one off the bus, the lock then takes the next of its
-names.  Each process of a controller also has a descriptor with the lock's name (`marker_fd`, a memory file), which the
+names.  Of programs that start at the same moment, and so see each other, the one with the first of the names stays.
+
+Each process of a controller also has a descriptor with the lock's name (`marker_fd`, a memory file), which the
 kernel lists: so the processes are found though they hang, and though the one that answers has died.
 """
 
@@ -114,6 +116,7 @@ class BusLock:
         self._on_stop, self._within_s = on_stop, within_s
         self._server: socket.socket | None = None
         self._number = -1  # of the name that this lock has
+        self._starts = True  # it may still leave to another one that starts
         self._thread: threading.Thread | None = None
         self._process = os.getpid()
         self._name = lock_name(interface, channel) if _has_lock(interface) else ""
@@ -133,6 +136,7 @@ class BusLock:
         self._thread.start()
         try:
             self._refuse_others()
+            self._starts = False
             self.marker_fd = os.memfd_create(self._name)
             self.stopped = stopped(self._name)
         except BaseException:
@@ -193,7 +197,7 @@ class BusLock:
                 holder.send("who")
             wait_for_answers(holders)
             for holder in holders:
-                if holder.is_controller:
+                if holder.is_controller and not (0 <= self._number < holder.number and holder.gives_way()):
                     raise self._refusal(holder.pid, f"another program controls {self._place}")
         if marked_processes(self._name):
             time.sleep(_RELEASE_S)
@@ -203,6 +207,7 @@ class BusLock:
         self.remarks += [
             f"{_program(holder.pid)} has the name of the lock of {self._place} and is no controller: it is ignored"
             for holder in holders
+            if not holder.gone
         ]
         if self._server is None:
             self.remarks.append(f"{self._place} cannot be locked: a second controller of another user is not kept off")
@@ -272,6 +277,8 @@ class BusLock:
         if message is None:
             return False
         answer: dict[str, Any] = {"controls": self._name, "pid": os.getpid()}
+        if self._starts:
+            answer["starts"] = True
         with contextlib.suppress(OSError):  # it has gone; its stop counts all the same
             if message.get("ask") == "stop":
                 if not may_ask(caller):
@@ -292,9 +299,10 @@ class Holder:
 
     def __init__(self, name: str, number: int) -> None:
         """`OSError` where no one has the name."""
-        self._name = name
+        self._name, self.number = name, number
         self._answer: dict[str, Any] | None = None
         self._data = b""
+        self.gone = False  # it has closed the connection
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.socket.setblocking(False)
@@ -320,10 +328,21 @@ class Holder:
             return self._answer is not None
         except OSError:
             part = b""
+        self.gone = not part
         self._data += part
         if self._answer is None and self._data.endswith(b"\n"):
             self._answer = parsed_line(self._data)
         return self._answer is not None or not part
+
+    def gives_way(self) -> bool:
+        """Whether it leaves within `ANSWER_S`: it starts as we do, and we have the name before its own."""
+        give_up_s = time.monotonic() + ANSWER_S
+        while self.is_controller and (self._answer or {}).get("starts") is True and time.monotonic() < give_up_s:
+            time.sleep(POLL_S)
+            self.send("who")
+            self._answer, self._data = None, b""
+            wait_for_answers([self], give_up_s - time.monotonic())
+        return self.gone
 
     @property
     def is_controller(self) -> bool:

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -356,6 +357,64 @@ def test_the_65th_caller_takes_the_place_of_the_oldest(channel: str) -> None:
         assert callers[0].recv(1000) == b""
         callers[1].sendall(b'{"ask": "who"}\n')
         assert callers[1].recv(1000)
+
+
+def test_of_programs_that_see_each_other_start_the_first_stays(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    look, all_have_names, ended = BusLock._refuse_others, threading.Barrier(3), threading.Barrier(3)
+    refused, kept = [], []
+
+    def start() -> None:
+        try:
+            lock = BusLock("socketcan", channel)
+        except BusError as error:
+            refused.append(str(error))
+        else:
+            kept.append(lock)
+        ended.wait(10.0)
+
+    def when_all_have_names(self: BusLock) -> None:
+        all_have_names.wait(10.0)
+        look(self)
+
+    monkeypatch.setattr(BusLock, "_refuse_others", when_all_have_names)
+    threads = [threading.Thread(target=start) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (lock,) = kept
+    assert len(refused) == 2
+    assert all("another program controls" in text for text in refused)
+    with first_holder(channel) as holder:
+        assert holder.number == 0
+    assert not lock.remarks
+    lock.close()
+
+
+@pytest.mark.parametrize("then", ["it has the bus", "silence"])
+def test_one_that_starts_and_does_not_leave_keeps_another_off(
+    channel: str, name: str, monkeypatch: pytest.MonkeyPatch, then: str
+) -> None:
+    monkeypatch.setattr("jointctl.drivers.bus_lock.ANSWER_S", 0.3)
+    who = {"controls": name, "pid": os.getpid()}
+    with squatter(f"{name}-1") as listener:
+
+        def answer() -> None:
+            end, _ = listener.accept()
+            with end:
+                for message in ({**who, "starts": True}, who):
+                    end.recv(100)
+                    send_line(end, message)
+                    if then == "silence":
+                        break
+                while end.recv(100):
+                    pass
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(BusError, match="another program controls"):
+            BusLock("socketcan", channel)
+        thread.join()
 
 
 @pytest.mark.parametrize(
