@@ -199,15 +199,15 @@ class BusLock:
             for holder in holders:
                 if holder.is_controller and not (0 <= self._number < holder.number and holder.gives_way()):
                     raise self._refusal(holder.pid, f"another program controls {self._place}")
+            strangers = [holder.pid for holder in holders if not holder.left]
         if marked_processes(self._name):
             time.sleep(_RELEASE_S)
         if marked := marked_processes(self._name):
             text = f"another program that does not answer still controls {self._place}"
             raise self._refusal(marked[0], text)
         self.remarks += [
-            f"{_program(holder.pid)} has the name of the lock of {self._place} and is no controller: it is ignored"
-            for holder in holders
-            if not holder.gone
+            f"{_program(pid)} has the name of the lock of {self._place} and is no controller: it is ignored"
+            for pid in strangers
         ]
         if self._server is None:
             self.remarks.append(f"{self._place} cannot be locked: a second controller of another user is not kept off")
@@ -301,8 +301,7 @@ class Holder:
         """`OSError` where no one has the name."""
         self._name, self.number = name, number
         self._answer: dict[str, Any] | None = None
-        self._data = b""
-        self.gone = False  # it has closed the connection
+        self._data, self._left = b"", False
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.socket.setblocking(False)
@@ -328,7 +327,7 @@ class Holder:
             return self._answer is not None
         except OSError:
             part = b""
-        self.gone = not part
+        self._left = not part
         self._data += part
         if self._answer is None and self._data.endswith(b"\n"):
             self._answer = parsed_line(self._data)
@@ -342,7 +341,7 @@ class Holder:
             self.send("who")
             self._answer, self._data = None, b""
             wait_for_answers([self], give_up_s - time.monotonic())
-        return self.gone
+        return self._left
 
     @property
     def is_controller(self) -> bool:
@@ -364,12 +363,8 @@ class Holder:
     @property
     def left(self) -> bool:
         """Whether it has given the lock back, or has died."""
-        try:
-            return not self.socket.recv(_LONGEST)
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True
+        self.poll()
+        return self._left
 
 
 def _holders(name: str, but: int = -1) -> list[Holder]:
