@@ -6,10 +6,10 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model; then all of it again with an observer that is paired and a lead that is that of each joint, with friction
-that the controller knows, which leaves what the arm itself does, without observer and adaptation, computed torque
-alone, and with soft reducers of size 25, 20 and 17, two encoders a joint and their law, whose gains are chosen for all
-poses.  Of the parts all are run, or those that are named.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does, with
+an observer that is not paired and a lead that is the same for all joints, without observer and adaptation, computed
+torque alone, and with soft reducers of size 25, 20 and 17, two encoders a joint and their law, whose gains are chosen
+for all poses.  Of the parts all are run, or those that are named.
 Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
@@ -47,21 +47,21 @@ KINDS = {
     "whole model": ArmFeedForward.WHOLE,
 }  # fmt: skip
 PARTS: dict[str, dict[str, bool]] = {
-    "friction as in study": {}, "paired observer": {"paired": True}, "friction as believed": {"known": True},
-    "and paired observer": {"known": True, "paired": True}, "without observer": {"observer": False},
+    "friction as in study": {}, "friction as believed": {"known": True}, "observer not paired": {"paired": False},
+    "without observer": {"observer": False},
     "flexible joints": {"flexible": True},
 }  # fmt: skip
 
 
 def random_arm(
     arm: ArmConfig, seed: int, index: int, *, known: bool = False, observer: bool = True,
-    paired: bool = False, flexible: bool = False,
+    paired: bool = True, flexible: bool = False,
 ) -> ArmConfig:  # fmt: skip
     """Arm number `index` of the study with this seed.
 
     `known`: its friction is the believed one, without ripples.  Without `observer` the law is computed torque alone.
-    `paired`: the observer is, and the feed-forward leads by each joint's own delay and lag.  `flexible`: the reducers
-    are soft, and their stiffness is known to 15 %.
+    Not `paired`: nor is the observer, and the feed-forward leads by 1.5 ms whatever a joint's delay and lag are.
+    `flexible`: the reducers are soft, and their stiffness is known to 15 %.
     """
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
@@ -77,11 +77,11 @@ def random_arm(
             exact = {"friction_scale": (1.0, 1.0), "friction_ripple": (0.0, 0.0), "torque_ripple_Nm": (0.0, 0.0)}
             ensemble = ensemble.model_copy(update=exact)
         if not observer:
-            alone = {"kind": "computed_torque", "observer_radps": 0.0, "adaptation": None}
+            alone = {"kind": "computed_torque", "observer_radps": 0.0, "observer_paired": False, "adaptation": None}
             config = config.model_copy(update={"control": config.control.model_copy(update=alone)})
-        if paired:
-            better = {"observer_paired": True, "feed_forward_lead_s": "auto"}
-            config = config.model_copy(update={"control": config.control.model_copy(update=better)})
+        if not paired:
+            as_it_comes = {"observer_paired": False, "feed_forward_lead_s": 0.0015}
+            config = config.model_copy(update={"control": config.control.model_copy(update=as_it_comes)})
         if flexible:
             drawn = with_reducer(arm, number, ensemble, seed, index)
         else:
