@@ -328,6 +328,23 @@ def test_plants_are_a_number_or_an_ensemble_or_both(words: list[str], plants: in
     assert (settings.plants, settings.plant.flexible) == (plants, flexible)
 
 
+def test_flexible_plants_get_the_joint_and_the_laws_that_are_made_for_them() -> None:
+    settings = with_plants(StudySettings(), ["realistic"])
+    assert (settings.base, settings.controllers[-1]) == ("realistic", "realistic")
+    given = checked({"base": "precise", "controllers": ["paper"], "plant": {"flexible": True}}, "test")
+    assert (given.base, given.controllers) == ("precise", ("paper",))
+    assert checked({"plant": {"flexible": False}}, "test").base == "precise"
+    with pytest.raises(ConfigurationError, match=r"test: plant"):
+        checked({"plant": 3}, "test")
+
+
+def test_a_law_for_flexible_joints_may_be_run_on_any_base_that_gets_a_reducer() -> None:
+    settings = checked({
+        "plants": 1, "after_s": 0.5, "base": "precise", "controllers": ["realistic"], "plant": {"flexible": True},
+    }, "test")  # fmt: skip
+    assert study(settings, Output(stdout=io.StringIO(), stderr=io.StringIO()), workers=Workers(1)) == 0
+
+
 @pytest.mark.parametrize("word", ["0", "-1", "many", "1.5", ""])
 def test_plants_that_are_neither_are_refused(word: str) -> None:
     with pytest.raises(ConfigurationError, match=r"plants \(="):

@@ -11,7 +11,8 @@ does not depend on the number of processes.  A study comes from flags and from a
 
     [plant]                           # any of the ranges of `EnsembleSettings`
     encoder_bits = [14, 16]
-    flexible = true                   # the realistic ensemble: a soft reducer, and an encoder on either side of it
+    flexible = true                   # the realistic ensemble: a soft reducer, and an encoder on either side of it; the
+                                      # joint and the laws are then those of FLEXIBLE_DEFAULTS, unless they are given
 
     [variants.more_damping]           # keys of [control] changed, on top of a named controller
     of = "precise"
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
@@ -307,6 +308,9 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
 # --- what is compared ---
 
 
+FLEXIBLE_DEFAULTS = {"base": "realistic", "controllers": ("paper", "precise", "realistic")}
+
+
 class StudySettings(Section):
     """One study; a flag of the command line replaces the value of the file."""
 
@@ -318,6 +322,14 @@ class StudySettings(Section):
     controllers: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = DEFAULT
     plant: EnsembleSettings = EnsembleSettings()
     variants: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_flexible_joints(cls, data: Any) -> Any:
+        """What is not given is that of a joint whose reducer is not rigid."""
+        plant = data.get("plant")
+        given = plant.model_dump() if isinstance(plant, EnsembleSettings) else plant if isinstance(plant, dict) else {}
+        return {**FLEXIBLE_DEFAULTS, **data} if given.get("flexible") is True else data
 
 
 def load_study(path: Path) -> StudySettings:

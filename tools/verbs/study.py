@@ -81,7 +81,7 @@ def study(
     from jointctl.tools.configuration.drive_section import require_simulated
     from jointctl.tools.configuration.load import load_config, shipped_config
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.experiments.controller_study import run_study, study_controllers, write_csv
+    from jointctl.tools.experiments.controller_study import random_plant, run_study, study_controllers, write_csv
     from jointctl.tools.experiments.controllers import controller_config
     from jointctl.tools.experiments.many_runs import HERE
     from jointctl.tools.recording.report_page import check_target
@@ -99,9 +99,9 @@ def study(
         check_target(report, inputs)
     for target in (csv, figure):
         prepare_target(target)
-    controllers = study_controllers(settings)
+    controllers, joint = study_controllers(settings), random_plant(base, settings.plant, settings.seed, 0)
     for controller in controllers:
-        controller_config(base, controller)  # a contradiction is to be reported before an hour of simulation
+        controller_config(joint, controller)  # a contradiction is to be reported before an hour of simulation
     title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
     with output.progress(title, settings.plants) as advance:
         result = run_study(base, controllers, settings, workers=workers or HERE, progress=advance)
@@ -233,10 +233,10 @@ def with_plants(settings: StudySettings, given: list[str]) -> StudySettings:
     """How many plants, and of which ensemble."""
     from jointctl.tools.experiments.controller_study import checked
 
-    changed = settings.model_dump()
+    changed = settings.model_dump(exclude_unset=True)
     for text in given:
         if text in ("rigid", "realistic", "loaded"):
-            changed["plant"] |= {"flexible": text != "rigid", "loaded": text == "loaded"}
+            changed["plant"] = changed.get("plant", {}) | {"flexible": text != "rigid", "loaded": text == "loaded"}
         elif text.isascii() and text.isdigit():
             changed["plants"] = int(text)
         else:
@@ -259,6 +259,6 @@ def study_verb(
 
     given = {key: value for key, value in vars(flags).items() if key != "plants" and value not in (None, [])}
     settings = load_study(file) if file is not None else StudySettings()
-    settings = checked({**settings.model_dump(), **given}, "command line")
+    settings = checked({**settings.model_dump(exclude_unset=True), **given}, "command line")
     settings = with_plants(settings, flags.plants or [])
     return study(settings, output, file=file, workers=workers, csv=csv, figure=figure, report=report)
