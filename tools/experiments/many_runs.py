@@ -10,12 +10,14 @@ from __future__ import annotations
 import ipaddress
 import multiprocessing
 import platform
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import islice
+from types import ModuleType
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -50,7 +52,10 @@ class Workers:
         with self._executor() as (executor, at_once):
             pending: set[Future[Result]] = set()
             while True:
-                with interrupts_left_to_the_parent():  # the processes start with the first tasks
+                with (
+                    interrupts_left_to_the_parent(),
+                    _without_main(function),
+                ):  # the processes start with the first tasks
                     pending |= {executor.submit(_same_version, VERSION, function, task)
                                 for task in islice(left, at_once - len(pending))}  # fmt: skip
                 if not pending:
@@ -92,6 +97,21 @@ def _of_this_computer(count: int) -> Iterator[tuple[Executor, int]]:
         if not ended:
             for process in set(multiprocessing.active_children()) - before:
                 process.terminate()
+
+
+@contextmanager
+def _without_main(function: Callable[..., Any]) -> Iterator[None]:
+    """A spawned process runs the file of `__main__` again: only where `function` is in it.
+
+    A user's program, whose calls the processes would repeat, may have moved joints before.
+    """
+    main = sys.modules["__main__"]
+    if function.__module__ != "__main__":
+        sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 # --- a cluster ---

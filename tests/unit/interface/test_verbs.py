@@ -46,6 +46,19 @@ def test_importing_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True).stdout == "[]\n"
 
 
+def test_the_processes_of_a_study_do_not_run_the_users_program_again(tmp_path: Path) -> None:
+    """It may have moved a joint before, and need not protect what it does by a condition on its name."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import jointctl\n"
+        "print('once')\n"
+        "found = jointctl.study(plants=['3'], controllers=['pid'], after_s=0.0, workers=2, quiet=True)\n"
+        "print(found.values('pid', 'rmse_mrad').shape)\n"
+    )
+    done = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300.0)
+    assert (done.stdout, done.returncode) == ("once\n(3,)\n", 0), done.stderr
+
+
 def test_check_gives_the_margins() -> None:
     report = jointctl.check("virtual")
     assert report.verdict == "ok"
