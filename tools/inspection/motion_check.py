@@ -222,6 +222,7 @@ _SCALE_CURE = (
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
+HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
 LITTLE_WORK = 0.05  # of the largest torque times the farthest way
 FRICTION_FACTOR = 2.5  # measured over configured static friction, either way
@@ -259,6 +260,7 @@ class Motion:
     torque_ratio: float | None  # measured over commanded; None where the drive measures none
     other_ratio: float | None  # way of the other encoder over that of this one
     other_moved_rad: float
+    held_Nm: float  # with which the spring held it where something had moved it against the torque; 0: it did not
 
     @property
     def along(self) -> bool:
@@ -274,7 +276,7 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     return np.convolve(values, np.ones(cycles) / cycles, "valid")
 
 
-def motion_of(records: np.recarray, threshold_rad: float) -> Motion | None:
+def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> Motion | None:
     """None if the drive was never enabled."""
     rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
@@ -302,7 +304,20 @@ def motion_of(records: np.recarray, threshold_rad: float) -> Motion | None:
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
         other_moved_rad=float(other[np.argmax(np.abs(other))]),
+        held_Nm=_held_Nm(way[powered], pushed[powered], threshold_rad, held_cycles),
     )
+
+
+def _held_Nm(way: np.ndarray, torque: np.ndarray, threshold_rad: float, cycles: int) -> float:
+    """Torque in the last place away from the start where the joint stood for so many cycles and was pulled back; or 0.
+
+    A joint with a wrong sign does not come to stand: the torque drives it on.
+    """
+    for end in range(len(way), cycles - 1, -max(cycles // 4, 1)):
+        stood, pulled_Nm = way[end - cycles : end], float(torque[end - 1])
+        if np.ptp(stood) < threshold_rad / 3.0 and abs(stood[-1]) >= threshold_rad and pulled_Nm * stood[-1] < 0.0:
+            return pulled_Nm
+    return 0.0
 
 
 def motion_findings(
@@ -314,7 +329,9 @@ def motion_findings(
     if second is not None and second.law == "joint_encoder":
         law, other = other, law
     threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * law_resolution_rad(config))
-    motion = motion_of(records, threshold_rad)
+    # a reading that stands still ends the check before it has stood for long
+    held_cycles = 1 if fault is Fault.POSITION_FROZEN else round(HELD_s * config.loop.rate_Hz)
+    motion = motion_of(records, threshold_rad, held_cycles)
     if motion is None:
         yield ended_finding(records, fault, text)
         return
@@ -327,18 +344,23 @@ def motion_findings(
         if fault is not Fault.NONE and fault not in _STANDING_FAULTS:
             yield ended_finding(records, fault, text)
         return
-    encoders = list(_encoders(motion, law, other)) if second is not None else []
+    along = motion.along or (motion.held_Nm != 0.0 and fault is Fault.NONE)  # it was pulled to and fro, and followed
+    loaded = not along and motion.held_Nm != 0.0
+    encoders = list(_encoders(motion, None if loaded else along, law, other)) if second is not None else []
     yield from encoders
-    direction = _direction(motion, law, other, numbers)
+    direction = _loaded(motion, numbers) if loaded else _direction(motion, along, law, other, numbers)
     yield direction
     if motion.torque_ratio is not None:
         yield _measured_torque(motion.torque_ratio)
-    if motion.along:
+    stands = not loaded and fault in (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED)
+    if stands:
+        yield _came_to_stand(motion)
+    elif motion.along:
         yield from _friction(motion, plan)
-    explained = direction.status == PROBLEM and fault in _WAY_FAULTS
+    explained = direction.status == PROBLEM and fault in (_STANDING_FAULTS if loaded else _WAY_FAULTS)
     if fault is Fault.POSITION_DISAGREEMENT:
         explained = explained or any(finding.status == PROBLEM for finding in encoders)
-    if fault is not Fault.NONE and not explained:
+    if fault is not Fault.NONE and not explained and not stands:
         yield ended_finding(records, fault, text)
 
 
@@ -364,7 +386,8 @@ def _standing(
     return Finding("motion", PROBLEM, reading, remedy, numbers)
 
 
-def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
+def _encoders(motion: Motion, along: bool | None, law: str, other: str) -> Iterator[Finding]:
+    """`along`: whether the joint moved with the torque by the encoder of the law; None where that is not known."""
     ratio = motion.other_ratio
     if ratio is None:
         return
@@ -378,9 +401,11 @@ def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
             numbers,
         )
     elif ratio < 0.0:
-        wrong = other if motion.along else law
         text = f"[{law}] and [{other}] count against each other"
-        remedy = f"{wrong}.direction: [{law if wrong == other else other}] agrees with the torque"
+        wrong, right = (other, law) if along else (law, other)
+        remedy = f"{wrong}.direction: [{right}] agrees with the torque"
+        if along is None:
+            remedy = f"{law}.direction or {other}.direction: turn the joint by hand with the power off"
         yield Finding("two encoders", PROBLEM, text, remedy, numbers)
     if abs(ratio) >= 0.02 and abs(abs(ratio) - 1.0) > SAME_SCALE:
         text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}]"
@@ -390,11 +415,35 @@ def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
         yield Finding("two encoders", OK, f"the same direction, and {ratio:.3f} times the same way", "", numbers)
 
 
-def _direction(motion: Motion, law: str, other: str, numbers: dict[str, Any]) -> Finding:
-    way = f"by up to {abs(motion.moved_rad) * 1e3:.1f} mrad ({math.degrees(abs(motion.moved_rad)):.2f} deg)"
-    if not motion.along:
+def _way(motion: Motion) -> str:
+    return f"by up to {abs(motion.moved_rad) * 1e3:.1f} mrad ({math.degrees(abs(motion.moved_rad)):.2f} deg)"
+
+
+_LOAD_REMEDY = (
+    "free it, or state its load: joint.gravity_Nm, joint.gravity_zero_rad; a joint of an arm is checked in a pose in "
+    "which it hangs down; more --torque"
+)
+
+
+def _loaded(motion: Motion, numbers: dict[str, Any]) -> Finding:
+    text = (
+        f"something moved the joint against the torque, {_way(motion)}, and it stood at {abs(motion.held_Nm):.1f} Nm: "
+    )
+    return Finding("load", PROBLEM, f"{text}a load or an end stop; no direction can be judged", _LOAD_REMEDY, numbers)
+
+
+def _came_to_stand(motion: Motion) -> Finding:
+    text = f"the joint, or its reading, came to stand at up to {motion.torque_max_Nm:.1f} Nm: "
+    text += "a load, an end stop, more friction than configured, or the encoder"
+    return Finding("load", PROBLEM, text, f"{_LOAD_REMEDY}; the encoder's cable")
+
+
+def _direction(motion: Motion, along: bool, law: str, other: str, numbers: dict[str, Any]) -> Finding:
+    way = _way(motion)
+    if not along:
         remedy = (
             f"if the joint turned the way that you call positive at first: {law}.direction; else drive.torque_direction"
+            "; but first make sure that no load moved it, such as gravity that joint.gravity_Nm does not state"
         )
         if motion.other_ratio is not None and motion.other_ratio < -0.02:
             remedy = f"{law}.direction: [{other}] agrees with the torque"

@@ -213,7 +213,7 @@ class Tune:
             findings = list(motion_findings(config, plan, carried.records, carried.fault, carried.text))
             bad = [finding for finding in findings if finding.status == PROBLEM]
             # it stands, or comes to stand again, under a torque that is too small for it
-            stands = bool(bad) and all(finding.topic in ("motion", "check") for finding in bad)
+            stands = bool(bad) and all(finding.topic in ("motion", "load", "check") for finding in bad)
             stands = stands and carried.fault in (Fault.NONE, Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED)
             if not (stands and plan.torque_Nm < self.config.limits.torque_max_Nm):
                 break

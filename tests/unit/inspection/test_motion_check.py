@@ -288,6 +288,26 @@ def test_a_wrong_sign(tmp_path: Path, change: Any, counts: int) -> None:
     assert_gentle(config, records)
 
 
+@pytest.mark.parametrize("friction", [0.1, 1.0])
+@pytest.mark.parametrize("load_Nm", [-28.0, -18.0, 22.0, 35.0])
+@pytest.mark.parametrize("counts", [16384, 524288])
+def test_a_load_that_the_file_does_not_state_is_taken_for_no_wrong_sign(
+    tmp_path: Path, friction: float, load_Nm: float, counts: int
+) -> None:
+    """As of gravity, when the brake opens; and no load hides a wrong sign."""
+    scales = {"virtual__friction_positive_scale": friction, "virtual__friction_negative_scale": friction}
+    config = config_with(tmp_path, encoder__counts_per_turn=counts, **scales)
+    for change in (None, reverse_encoder, reverse_torque):
+        found, records, _ = checked(config, change, one_fault(FaultKind.LOAD_JUMP, 0.2, magnitude=load_Nm))
+        topics = {finding.topic for finding in found.values() if finding.status == PROBLEM}
+        if change is None:
+            assert topics <= {"load", "check", "motion"}
+            assert "load" not in topics or "joint.gravity_Nm" in found["load"].remedy
+        else:
+            assert topics in ({"direction"}, {"motion"})
+        assert_gentle(config, records)
+
+
 @pytest.mark.parametrize(("law", "wrong"), [("encoder", "encoder"), ("joint_encoder", "encoder")])
 def test_with_two_encoders_the_wrong_one_is_named(tmp_path: Path, law: str, wrong: str) -> None:
     config = config_with(tmp_path, {**NODE, "law": law}, virtual__initial_position_rad=0.0)
