@@ -290,7 +290,8 @@ SINES = 2 * BRISTLES  # the first part that is one
 MOST = 1.2  # that a kind of bristles may weigh
 LEAST_SHARE = 0.5  # of the bristles that take something over
 TAKEN_radps = 20.0  # slow: with a reducer that is not rigid, friction moves the desired motor angle as well
-LET_GO = 3.0  # by how many times their stiffness the bristles give way to a joint that goes on
+LET_GO = 2.0  # by how many times their stiffness the bristles give way to a joint that goes on
+LET_GO_s = 0.01  # not at once, or the joint, a spring there, would swing back too far
 BACK_radps, BACK_s = 30.0, 0.08  # a rigid one goes back, for this time
 TURNING_CYCLES = 4  # a motion that turns back rests for one
 MOST_LET_GO, MOST_HELD = 0.8, 0.95  # of what they held when the motion came to rest
@@ -401,10 +402,11 @@ def _share_kept(
         return 1.0
     along_rad = math.copysign(error_rad, error_rad * held_Nm)
     rested_s = (state.resting - TURNING_CYCLES) * law.period_s
-    wanted_Nm = 0.0
     if along_rad > state.rest_error_rad:
-        wanted_Nm = LET_GO * stiffness_Nmprad * (along_rad - state.rest_error_rad)
+        state.to_let_go_Nm += LET_GO * stiffness_Nmprad * (along_rad - state.rest_error_rad)
         state.rest_error_rad = along_rad
+    wanted_Nm = min(law.period_s / LET_GO_s, 1.0) * state.to_let_go_Nm
+    state.to_let_go_Nm -= wanted_Nm
     if law.kind == ControllerKind.FLEXIBLE_JOINT:
         if rested_s <= AT_ONCE_s:
             wanted_Nm += AT_ONCE * began * law.period_s / AT_ONCE_s
@@ -434,7 +436,7 @@ def _comes_to_rest(
         state.rest_disturbance_Nm = disturbance_Nm
         if law.kind == ControllerKind.FLEXIBLE_JOINT and min(state.moved_s[0], state.moved_s[1]) > LEAST_MOVED_s:
             state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
-        state.rest_friction_Nm = held_Nm
+        state.rest_friction_Nm, state.to_let_go_Nm = held_Nm, 0.0
         state.rest_error_rad = max(math.copysign(error_rad, error_rad * held_Nm), 0.0)
     if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
         state.resting += 1

@@ -1,6 +1,6 @@
-"""Every record of the controller: constants (`*Constants`, set once), state (`*State`), and what passes between blocks.
+"""Every record of the controller, in SI units: constants (`*Constants`, set once), state (`*State`), what passes on.
 
-SI units throughout.  `joint_` is the low-velocity side of the reducer, `motor_` the other one."""
+`joint_` is the low-velocity side of the reducer, `motor_` the other one."""
 
 from __future__ import annotations
 
@@ -127,10 +127,10 @@ class AdaptationState:
     rest_disturbance_Nm: f8  # of the observer's, what it keeps at rest
     rest_friction_Nm: f8  # of the bristles, when the desired motion came to rest
     rest_error_rad: f8  # the furthest in the direction of that torque since
+    to_let_go_Nm: f8  # of that torque
     resting: i4  # cycles since, 0 while it goes on
     cycle: i4
-    # of a joint that is not rigid with both encoders, see `flexible_joint`
-    seen_motor: VelocityState  # of whose errors the rates count
+    seen_motor: VelocityState  # of the errors of a joint that is not rigid, see `flexible_joint`
     seen_link: VelocityState
     seen_integral_Nms: f8  # of the observer
     seen_disturbance_Nm: f8

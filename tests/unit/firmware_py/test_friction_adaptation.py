@@ -23,6 +23,7 @@ from jointctl.firmware_py.friction import (
     AT_ONCE_s,
     BACK_radps,
     BACK_s,
+    LET_GO_s,
     adapt,
     adapted_feed_forward_Nm,
     fed_before_Nm,
@@ -196,12 +197,16 @@ def test_the_bristles_let_go_of_a_joint_that_goes_on_after_the_move(law: Any, si
     for error in (-4e-5, 2e-5):  # springing back and returning is not going on
         take_at_rest(law, state, 0.0, 0.0, side * error)
     assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(fed)
-    for k in range(11):  # it goes on by 10 microradians
-        take_at_rest(law, state, 0.0, 0.0, side * (2e-5 + k * 1e-6))
-    fed -= side * LET_GO * 8e4 * 1e-5
-    assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(fed)
+    most_Nm, cycles = side * LET_GO * 8e4 * 1e-5, round(LET_GO_s / law.period_s)
+    for k in range(10 * cycles):  # it goes on by 10 microradians
+        take_at_rest(law, state, 0.0, 0.0, side * 3e-5)
+        left = (1.0 - 1.0 / cycles) ** (k + 1)
+        assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(fed - (1.0 - left) * most_Nm)
+    fed -= most_Nm
+    assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(fed, rel=1e-4)
     assert side * state.rest_friction_Nm * MOST_LET_GO > LET_GO * 8e4 * 1e-5
-    take_at_rest(law, state, 0.0, 0.0, side * 1e-2)
+    for _ in range(10 * cycles):
+        take_at_rest(law, state, 0.0, 0.0, side * 1e-2)
     least = (1.0 - MOST_LET_GO) * state.rest_friction_Nm
     assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(least)
 
