@@ -115,13 +115,23 @@ def test_times_must_ascend_without_a_gap(joint: Joint) -> None:
     at_rad = joint.state.desired_position_rad
     joint.command(at_rad, 0.0, time_s=7.0)
     joint.step(0.01)
-    for time_s in (7.0, 6.9, 7.5):
+    for time_s in (7.0, 6.9, 7.5, 4e9):
         with pytest.raises(SetPointError, match="after the set-point before"):
             joint.command(at_rad, 0.0, time_s=time_s)
     joint.command(at_rad, 0.0, time_s=7.01)
 
 
 def test_a_set_point_without_a_time_may_follow_one_with_a_time(joint: Joint) -> None:
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, 1e12, -1e300, "7.01"])
+def test_a_time_that_is_none_refuses_the_set_point(joint: Joint, time_s: float) -> None:
+    at_rad = joint.state.desired_position_rad
+    joint.command(at_rad, 0.0, time_s=7.0)
+    joint.step(0.01)
+    with pytest.raises(SetPointError, match=r"time_s .* must be in \[-4e\+09..4e\+09\]|made of numbers"):
+        joint.command(at_rad, 0.0, time_s=time_s)
+    joint.command(at_rad, 0.0, time_s=7.01)
+
+
     at_rad = joint.state.desired_position_rad
     joint.command(at_rad + 0.001, time_s=7.0)
     joint.step(0.01)
