@@ -151,11 +151,14 @@ class Program:
     def __init__(self, motor: Motor) -> None:
         self._motor, self._axes = motor, motor.axes
         self._stream: SetPointStream | None = None
-        self._enabled = False
-        self._lasts_s = 0.0  # of the newest motion
+        self._begun = self._enabled = False
 
     def __enter__(self) -> Self:
         self._motor.begin()
+        if self._begun:
+            what = type(self).__name__
+            raise UsageError(f"a {what} is for one `with` block, and this one has had it; begin a new {what}")
+        self._begun = True
         return self
 
     def __exit__(
@@ -220,8 +223,6 @@ class Program:
         """Of all joints along quintics that begin and end together."""
         from jointctl.firmware_py.kernel import plain
         from jointctl.firmware_py.live_change import move_duration_s
-        from jointctl.tools.session.live_changes import new_motion
-        from jointctl.tools.session.plan import blamed
 
         starts_rad = self._at_rest()
         if duration_s is None:
@@ -231,14 +232,21 @@ class Program:
                 return
         motions = []
         for number, (name, config) in enumerate(zip(self._axes.names, self._axes.joints, strict=True)):
+        motions = self._moves(starts_rad, targets_rad, duration_s)
+        self._require_torques(motions, self._motor.tables, duration_s)
+        self._go(motions, wait)
+
+    def _moves(self, starts_rad: Sequence[float], targets_rad: Sequence[float], duration_s: float) -> list[NewMotion]:
+        from jointctl.tools.session.live_changes import new_motion
+        from jointctl.tools.session.plan import blamed
+
             values = {
                 "kind": "min_jerk", "duration_s": 0.0, "start_rad": starts_rad[number],
                 "target_rad": targets_rad[number], "move_s": duration_s, "dwell_s": 0.0, "repeat": False,
             }  # fmt: skip
             with blamed(name):
                 motions.append(NewMotion(*new_motion(config, self._motor.tables[number], values)))
-        self._require_torques(motions, self._motor.tables, duration_s)
-        self._go(motions, duration_s, wait)
+        return motions
 
     def _follow(self, times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, wait: bool) -> None:
         """Of all joints along splines through the rows of `positions_rad`, shape (n, axes)."""
@@ -254,21 +262,25 @@ class Program:
             trajectory[0].kind, trajectory[0].table_rows = TrajectoryKind.TABLE, len(table)
             with blamed(name):
                 motions.append(NewMotion(trajectory, checked_motion(config, trajectory[0], table)))
-        duration_s = float(tables[0, -1, 0])
-        self._require_torques(motions, tables, duration_s)
+        self._require_torques(motions, tables, float(tables[0, -1, 0]))
         starts_rad = self._at_rest()
-        self._motor.tables[:, : tables.shape[1]] = tables
         ways = zip(self._motor.constants, tables[:, 0, 1] - starts_rad, strict=True)
         move_s = max(float(plain(move_duration_s)(axis.change, way)) for axis, way in ways)
-        self._go(motions, duration_s, wait, move_s)
+        if move_s > 0.0 and self._axes.arm is not None:
+            way = self._moves(starts_rad, tables[:, 0, 1].tolist(), move_s)
+            self._require_torques(way, tables, move_s, "the way to the beginning of the table")
+        self._motor.tables[:, : tables.shape[1]] = tables
+        self._go(motions, wait, move_s)
 
-    def _require_torques(self, motions: Sequence[NewMotion], tables: np.ndarray, duration_s: float) -> None:
+    def _require_torques(
+        self, motions: Sequence[NewMotion], tables: np.ndarray, duration_s: float, what: str = "the motion"
+    ) -> None:
         """`ConfigurationError` where the arm's model asks more of a joint than its limit on the way."""
         if self._axes.arm is not None:
             from jointctl.tools.analysis.arm_check import require_torques
 
             trajectories = [motion.trajectory[0] for motion in motions]
-            require_torques(self._axes.arm, trajectories, tables, duration_s, self._alive)
+            require_torques(self._axes.arm, trajectories, tables, duration_s, self._alive, what)
 
     def _command(self, values: SetPointValues, time_s: float | None) -> None:
         stream = self._following()
@@ -288,23 +300,27 @@ class Program:
         if self._motor.constants[0].trajectory.kind == TrajectoryKind.TABLE:  # its rows may be written again
             holds = self._motor.constants["trajectory"].copy()
             holds["kind"], holds["start_rad"] = TrajectoryKind.STREAM, rest_rad
-            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))], 0.0, True)
+            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))], True)
         return rest_rad
 
     @property
     def _under_way(self) -> bool:
         """Whether a motion that was asked for has not come to its end."""
-        for constants, state in zip(self._motor.constants, self._motor.axis, strict=True):
+        motor = self._motor
+        for constants, state, table in zip(motor.constants, motor.axis, motor.tables, strict=True):
             if state.change.motion != MotionChange.NONE:
                 return True
-            if constants.trajectory.kind != TrajectoryKind.STREAM and state.trajectory_s < self._lasts_s:
+            trajectory = constants.trajectory  # the loop's own, also where an exception has ended the call
+            lasts_s = (
+                table[trajectory.table_rows - 1, 0] if trajectory.kind == TrajectoryKind.TABLE else trajectory.move_s
+            )
+            if trajectory.kind != TrajectoryKind.STREAM and state.trajectory_s < lasts_s:
                 return True
         return False
 
-    def _go(self, motions: Sequence[NewMotion], duration_s: float, wait: bool, move_s: float = 0.0) -> None:
+    def _go(self, motions: Sequence[NewMotion], wait: bool, move_s: float = 0.0) -> None:
         self._alive()
         self._motor.post(motions, move_s)
-        self._lasts_s = duration_s
         while wait and self._under_way:
             self._alive()
             self._motor.wait(POLL_S)
