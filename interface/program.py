@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from numbers import Integral
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
+from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError, one_line
 from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.motion_records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
@@ -154,11 +155,11 @@ class Program:
         self._begun = self._enabled = False
 
     def __enter__(self) -> Self:
-        self._motor.begin()
         if self._begun:
             what = type(self).__name__
             raise UsageError(f"a {what} is for one `with` block, and this one has had it; begin a new {what}")
         self._begun = True
+        self._motor.begin()
         return self
 
     def __exit__(
@@ -175,13 +176,14 @@ class Program:
         """Check stability margin and limits, then power on: it holds where it stands.  Once for each object.
 
         `approve` is shown the lines of the motion envelope and has the last word; without it this call is the consent.
+        It returns True or False: an answer in words, or one that is still awaited, is none (`UsageError`).
         `MarginError`, `MotionFault` or another `JointctlError` tells why it is not enabled.
         """
         if self._enabled:
             what = type(self).__name__
             raise UsageError(f"it was enabled before; after a stop or a fault a new {what} is needed")
         self._enabled = True
-        self._motor.enable(approve)
+        self._motor.enable(None if approve is None else partial(_answer, approve))
         self._stream = SetPointStream(self._motor, self._axes.names)
 
     def wait(self, seconds: float) -> None:
@@ -230,8 +232,6 @@ class Program:
             duration_s = max(float(plain(move_duration_s)(axis.change, end - start)) for axis, start, end in ways)
             if duration_s == 0.0:
                 return
-        motions = []
-        for number, (name, config) in enumerate(zip(self._axes.names, self._axes.joints, strict=True)):
         motions = self._moves(starts_rad, targets_rad, duration_s)
         self._require_torques(motions, self._motor.tables, duration_s)
         self._go(motions, wait)
@@ -240,6 +240,8 @@ class Program:
         from jointctl.tools.session.live_changes import new_motion
         from jointctl.tools.session.plan import blamed
 
+        motions = []
+        for number, (name, config) in enumerate(zip(self._axes.names, self._axes.joints, strict=True)):
             values = {
                 "kind": "min_jerk", "duration_s": 0.0, "start_rad": starts_rad[number],
                 "target_rad": targets_rad[number], "move_s": duration_s, "dwell_s": 0.0, "repeat": False,
@@ -326,6 +328,14 @@ class Program:
             self._motor.wait(POLL_S)
 
 
+def _answer(approve: Callable[[Sequence[str]], bool], lines: Sequence[str]) -> bool:
+    """What `approve` says; what only counts as true, as the text "n" does, is no consent."""
+    answer = approve(lines)
+    if not isinstance(answer, (bool, np.bool_)):
+        raise UsageError(f"approve (={one_line(repr(answer))[:40]}) must return True or False; nothing has moved")
+    return bool(answer)
+
+
 def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: int) -> np.ndarray:
     """Rows of the cubic splines, float64 (axes, n, 5); `ConfigurationError` for what makes none.
 
@@ -338,7 +348,7 @@ def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: in
     try:
         if any(np.asarray(array).dtype.kind in "bcmMSU" for array in given):  # times of a calendar count nanoseconds
             raise TypeError
-        times, positions = (np.asarray(array, np.float64) for array in given)
+        times, positions = (np.ma.asarray(array, np.float64).filled(np.nan) for array in given)
     except (TypeError, ValueError):
         raise ConfigurationError("times_s and positions_rad must be arrays of numbers") from None
     wanted = (len(times),) if positions.ndim == 1 and axes == 1 else (len(times), axes) if times.ndim else ()
