@@ -21,6 +21,7 @@ from jointctl.tools.inspection.health import PROBLEM, Finding
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.verbs.verb_options import ResultOutput
+from tests.configurations import written
 from tests.places import CONFIGS
 
 
@@ -57,6 +58,34 @@ def test_the_processes_of_a_study_do_not_run_the_users_program_again(tmp_path: P
     )
     done = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300.0)
     assert (done.stdout, done.returncode) == ("once\n(3,)\n", 0), done.stderr
+
+
+COPIED = """
+import sys, multiprocessing
+import jointctl
+
+def tried(call):
+    try:
+        call()
+    except jointctl.JointctlError as error:
+        print(__name__, type(error).__name__, flush=True)
+
+tried(jointctl.Joint("joint.toml").__enter__)
+tried(lambda: jointctl.run("joint.toml", yes=True, quiet=True))
+process = multiprocessing.get_context(sys.argv[1]).Process(target=print)
+process.start()
+process.join()
+"""
+
+
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_nor_does_a_process_of_the_program_itself_move_the_joint_again(tmp_path: Path, method: str) -> None:
+    """Python runs the file from its first line there, where no condition on `__name__` keeps it from that."""
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    (tmp_path / "program.py").write_text(COPIED)
+    command = [sys.executable, "-P", "program.py", method]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300.0)
+    assert done.stdout == "__main__ BusError\n" * 2 + "__mp_main__ UsageError\n" * 2, done.stderr
 
 
 def test_check_gives_the_margins() -> None:
