@@ -33,6 +33,7 @@ from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.set_points import load_check
+from jointctl.tools.verbs.start import occupy_standard_streams
 
 WHO = "the program"
 ENDED, AGAIN = "the run has ended", "begin a new Joint"
@@ -136,6 +137,7 @@ class LiveMotor:
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         self._process = os.getpid()
+        occupy_standard_streams()
         try:
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat

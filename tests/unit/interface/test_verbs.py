@@ -88,6 +88,31 @@ def test_nor_does_a_process_of_the_program_itself_move_the_joint_again(tmp_path:
     assert done.stdout == "__main__ BusError\n" * 2 + "__mp_main__ UsageError\n" * 2, done.stderr
 
 
+CLOSED = """
+import os
+import jointctl
+
+for descriptor in range(3):
+    os.close(descriptor)
+try:
+    {call}
+except jointctl.JointctlError as error:
+    found = [os.fstat(descriptor).st_rdev == os.stat(os.devnull).st_rdev for descriptor in range(3)]
+    open("found.txt", "w").write(f"{{type(error).__name__}} {{found}}")
+"""
+
+
+@pytest.mark.parametrize(
+    "call", ['jointctl.Joint("joint.toml").__enter__()', 'jointctl.run("joint.toml", yes=True, quiet=True)']
+)
+def test_what_a_program_prints_behind_closed_streams_does_not_land_in_a_bus(tmp_path: Path, call: str) -> None:
+    """As one does that has made a daemon of itself: the next socket would get the number of its standard output."""
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    (tmp_path / "program.py").write_text(CLOSED.format(call=call))
+    subprocess.run([sys.executable, "-P", "program.py"], cwd=tmp_path, timeout=300.0, check=True)
+    assert (tmp_path / "found.txt").read_text() == "BusError [True, True, True]"
+
+
 def test_check_gives_the_margins() -> None:
     report = jointctl.check("virtual")
     assert report.verdict == "ok"
