@@ -111,7 +111,11 @@ def _wake_main() -> None:
 
 @contextmanager
 def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
-    """Collect stop signals while the block runs instead of ending the program."""
+    """Collect stop signals while the block runs instead of ending the program; `UsageError` in another thread."""
+    if threading.current_thread() is not threading.main_thread():
+        raise UsageError(
+            "this takes over Ctrl-C, which Python allows in the main thread only", "call it there; a Joint may have any"
+        )
     signals = StopSignals(raising=raising)
     before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
     try:

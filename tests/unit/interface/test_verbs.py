@@ -7,6 +7,7 @@ import inspect
 import runpy
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 
@@ -111,6 +112,14 @@ def test_what_a_program_prints_behind_closed_streams_does_not_land_in_a_bus(tmp_
     (tmp_path / "program.py").write_text(CLOSED.format(call=call))
     subprocess.run([sys.executable, "-P", "program.py"], cwd=tmp_path, timeout=300.0, check=True)
     assert (tmp_path / "found.txt").read_text() == "BusError [True, True, True]"
+
+
+def test_what_moves_a_joint_is_refused_in_another_thread_in_words(tmp_path: Path) -> None:
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    with ThreadPoolExecutor(1) as threads:
+        done = threads.submit(jointctl.run, tmp_path / "joint.toml", yes=True, quiet=True)
+        with pytest.raises(jointctl.UsageError, match="in the main thread only"):
+            done.result()
 
 
 def test_check_gives_the_margins() -> None:
