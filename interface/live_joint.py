@@ -324,11 +324,10 @@ class LiveMotor:
         finally:
             self._stack.close()
         error, result = self._error, self.result
-        if self._told:
-            return
-        if isinstance(error, JointctlError) or (result is not None and result.faulty):
-            self._raise()
-        if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
-            raise error
-        if self._session is not None:
+        if not self._told:
+            if isinstance(error, JointctlError) or (result is not None and result.faulty):
+                self._raise()
+            if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
+                raise error
+        if self._session is not None:  # whatever the program has made of a fault
             drive_end.require_off(self._session.drive_state)

@@ -230,6 +230,19 @@ def test_a_program_that_ends_without_leaving_the_block_leaves_nothing_running(be
     assert bench.disabled()
 
 
+def test_a_program_that_goes_on_after_a_fault_learns_that_its_drive_may_be_on(bench: Any) -> None:
+    drive = bench.joint_process(bench.config())
+    body = """
+    try: joint.wait(60.0)
+    except jointctl.MotionFault: say("fault")
+    """
+    program = bench.program(PROGRAM.format(body=body.strip(), approve="")).saw("enabled")
+    drive.end()
+    ended = program.saw("fault").finished(30.0)
+    assert "DeviceError: the drive did not confirm that it is off" in ended.err
+    assert "left" not in ended.err.split()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")
