@@ -138,7 +138,7 @@ class Arm(Program):
 
     def _numbers(self, name: str, given: npt.ArrayLike) -> tuple[float, ...]:
         try:
-            values = np.atleast_1d(np.asarray(given, object))
+            values: np.ndarray = np.atleast_1d(np.ma.asarray(given, object).filled(np.nan))
         except ValueError:  # of arrays that make none together
             values = np.zeros((0, 0))
         if values.shape != (len(self.names),):

@@ -33,6 +33,7 @@ from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.set_points import load_check
+from jointctl.tools.verbs.start import occupy_standard_streams
 
 WHO = "the program"
 ENDED, AGAIN = "the run has ended", "begin a new Joint"
@@ -49,8 +50,8 @@ class _Approval:
     dry_run = False
     brake = None  # a drive that is found enabled is left alone
 
-    def __init__(self, leave_if_asked: Callable[[], None]) -> None:
-        self._leave_if_asked = leave_if_asked
+    def __init__(self, leave_if_asked: Callable[[], None], stop_if_over: Callable[[], None]) -> None:
+        self._leave_if_asked, self._stop_if_over = leave_if_asked, stop_if_over
         self.lines: tuple[str, ...] = ()
         self.asked, self.answered = threading.Event(), threading.Event()
         self.answer = False
@@ -62,6 +63,7 @@ class _Approval:
         self.lines = tuple(lines)
         self.asked.set()
         while not self.answered.wait(POLL_S):
+            self._stop_if_over()
             self._leave_if_asked()
         return self.answer
 
@@ -69,9 +71,10 @@ class _Approval:
 class _ProgramDisplay(OnlyShows):
     """What the run says is kept for the program; motions of the program go to the session."""
 
-    def __init__(self) -> None:
+    def __init__(self, stop_if_over: Callable[[], None]) -> None:
+        self._stop_if_over = stop_if_over
         self.notes: list[str] = []
-        self.motions: list[PreparedMotion] = []
+        self.motions: list[PreparedMotion] = []  # the program's thread adds, the session's takes away
 
     def note(self, text: str) -> None:
         self.notes.append(text)
@@ -87,7 +90,9 @@ class _ProgramDisplay(OnlyShows):
             self.notes.append(event.text)
 
     def requests(self) -> Sequence[ViewerRequest]:
-        taken, self.motions = self.motions, []
+        self._stop_if_over()
+        taken = self.motions[:]
+        del self.motions[: len(taken)]
         return taken
 
     def __enter__(self) -> _ProgramDisplay:
@@ -95,6 +100,10 @@ class _ProgramDisplay(OnlyShows):
 
     def __exit__(self, *_: object) -> None:
         """Nothing to take away."""
+
+
+class _SessionThread(threading.Thread):
+    """Which Python waits for when the program ends: the drive is off then."""
 
 
 class LiveMotor:
@@ -108,7 +117,7 @@ class LiveMotor:
         self.axes = axes_of(source.config)
         self.drive = session_drive(self.axes.joints[0].drive.kind)
         self._motions: list[FreeMotion] = []
-        self._display = _ProgramDisplay()
+        self._display = _ProgramDisplay(self._stop_if_over)
         self._stack, self._bus = ExitStack(), ExitStack()  # of the whole block; of the session
         self._thread: threading.Thread | None = None
         self._session: Session | None = None
@@ -128,6 +137,7 @@ class LiveMotor:
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         self._process = os.getpid()
+        occupy_standard_streams()
         try:
             own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
@@ -146,13 +156,13 @@ class LiveMotor:
             )
             if control.signals.commanded_ns:
                 raise MotionFault(f"stopped by {control.signals.name} before it began; nothing has moved", AGAIN)
-            self._approval = _Approval(control.signals.leave_if_asked)
+            self._approval = _Approval(control.signals.leave_if_asked, self._stop_if_over)
             plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
             display = others.beside(lambda _: self._display)
             self._session = Session(plan, self._approval, output, control, display, others.set_points)
             self._session.own = own
-            self._thread = threading.Thread(target=self._run, name="jointctl session")
+            self._thread = _SessionThread(target=self._run, name="jointctl session")
             self._thread.start()
             for name in _NEEDED:  # commissioning waits for the drive most of the time
                 import_module(name)
@@ -176,6 +186,18 @@ class LiveMotor:
             self._error = error
         finally:
             self._bus.close()  # the drive is off for good: `jointctl stop` has no program to wait for any more
+
+    def _stop_if_over(self) -> None:
+        """Where the program has come to its end without leaving the block: what it leaves running moves nothing.
+
+        Python waits for threads that are no daemons before it ends: for those of sessions, and of the program's own.
+        """
+        control = self._control
+        if control is None or control.signals.count or threading.main_thread().is_alive():
+            return
+        left = [thread for thread in threading.enumerate() if thread.is_alive() and not thread.daemon]
+        if all(isinstance(thread, _SessionThread) for thread in left):
+            control.signals.name, control.signals.count = control.signals.name or "the end of the program", 1
 
     def _raise(self) -> None:
         """What has ended the session, if it has."""
@@ -209,7 +231,7 @@ class LiveMotor:
         if approval is None or session is None:
             raise MotionFault(*NOT_COMMISSIONED)
         self._raise()
-        approval.answer = True if approve is None else bool(approve(approval.lines))
+        approval.answer = approve is None or approve(approval.lines)
         approval.answered.set()
         if not approval.answer:
             self._join()
@@ -252,16 +274,20 @@ class LiveMotor:
     def post(self, motions: Sequence[NewMotion], move_s: float) -> None:
         self.require()
         answers: list[str] = []
-        for motion, name in zip(motions, self.axes.names, strict=True):
-            self._display.motions.append(
-                PreparedMotion("motion", WHO, {}, *motion, answered=answers.append, joint=name, move_s=move_s)
-            )
+        display = self._display
+        display.motions.extend([
+            PreparedMotion("motion", WHO, {}, *motion, answered=answers.append, joint=name, move_s=move_s)
+            for motion, name in zip(motions, self.axes.names, strict=True)
+        ])  # fmt: skip
         end_s = time.monotonic() + ANSWER_S
-        while len(answers) < len(motions):
-            self.require()
-            if time.monotonic() > end_s:
-                raise MotionFault(f"the loop did not answer within {ANSWER_S:g} s")
-            time.sleep(POLL_S)
+        try:
+            while len(answers) < len(motions):
+                self.require()
+                if time.monotonic() > end_s:
+                    raise MotionFault(f"the loop did not answer within {ANSWER_S:g} s")
+                time.sleep(POLL_S)
+        finally:
+            display.motions.clear()  # what has not been taken must not begin after this call
         if refused := [answer for answer in answers if answer]:
             raise MotionFault(f"the loop did not take the motion: {refused[0]}")
 
@@ -298,11 +324,10 @@ class LiveMotor:
         finally:
             self._stack.close()
         error, result = self._error, self.result
-        if self._told:
-            return
-        if isinstance(error, JointctlError) or (result is not None and result.faulty):
-            self._raise()
-        if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
-            raise error
-        if self._session is not None:
+        if not self._told:
+            if isinstance(error, JointctlError) or (result is not None and result.faulty):
+                self._raise()
+            if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
+                raise error
+        if self._session is not None:  # whatever the program has made of a fault
             drive_end.require_off(self._session.drive_state)

@@ -62,6 +62,7 @@ class LockstepMotor:
         name = self.axes.joints[0].path.name if self.axes.arm is None else self.axes.arm.path.name
         if approve is not None and not approve((f"simulated: {name}",)):
             raise MotionFault("the motion was not approved; nothing has moved")
+        self.constants["sequence"]["may_enable"] = 1
         self._until(AxisPhase.TRACKING)
 
     def _until(self, phase: AxisPhase) -> None:
@@ -149,4 +150,5 @@ class LockstepMotor:
 
 def _unwatched(constants: Any) -> Any:
     constants["sequence"]["supervisor_max_cycles"] = 0
+    constants["sequence"]["may_enable"] = 0  # until `enable`
     return constants

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from numbers import Integral
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
+from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError, one_line
 from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.motion_records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
@@ -151,10 +152,13 @@ class Program:
     def __init__(self, motor: Motor) -> None:
         self._motor, self._axes = motor, motor.axes
         self._stream: SetPointStream | None = None
-        self._enabled = False
-        self._lasts_s = 0.0  # of the newest motion
+        self._begun = self._enabled = False
 
     def __enter__(self) -> Self:
+        if self._begun:
+            what = type(self).__name__
+            raise UsageError(f"a {what} is for one `with` block, and this one has had it; begin a new {what}")
+        self._begun = True
         self._motor.begin()
         return self
 
@@ -172,13 +176,14 @@ class Program:
         """Check stability margin and limits, then power on: it holds where it stands.  Once for each object.
 
         `approve` is shown the lines of the motion envelope and has the last word; without it this call is the consent.
+        It returns True or False: an answer in words, or one that is still awaited, is none (`UsageError`).
         `MarginError`, `MotionFault` or another `JointctlError` tells why it is not enabled.
         """
         if self._enabled:
             what = type(self).__name__
             raise UsageError(f"it was enabled before; after a stop or a fault a new {what} is needed")
         self._enabled = True
-        self._motor.enable(approve)
+        self._motor.enable(None if approve is None else partial(_answer, approve))
         self._stream = SetPointStream(self._motor, self._axes.names)
 
     def wait(self, seconds: float) -> None:
@@ -220,8 +225,6 @@ class Program:
         """Of all joints along quintics that begin and end together."""
         from jointctl.firmware_py.kernel import plain
         from jointctl.firmware_py.live_change import move_duration_s
-        from jointctl.tools.session.live_changes import new_motion
-        from jointctl.tools.session.plan import blamed
 
         starts_rad = self._at_rest()
         if duration_s is None:
@@ -229,6 +232,14 @@ class Program:
             duration_s = max(float(plain(move_duration_s)(axis.change, end - start)) for axis, start, end in ways)
             if duration_s == 0.0:
                 return
+        motions = self._moves(starts_rad, targets_rad, duration_s)
+        self._require_torques(motions, self._motor.tables, duration_s)
+        self._go(motions, wait)
+
+    def _moves(self, starts_rad: Sequence[float], targets_rad: Sequence[float], duration_s: float) -> list[NewMotion]:
+        from jointctl.tools.session.live_changes import new_motion
+        from jointctl.tools.session.plan import blamed
+
         motions = []
         for number, (name, config) in enumerate(zip(self._axes.names, self._axes.joints, strict=True)):
             values = {
@@ -237,8 +248,7 @@ class Program:
             }  # fmt: skip
             with blamed(name):
                 motions.append(NewMotion(*new_motion(config, self._motor.tables[number], values)))
-        self._require_torques(motions, self._motor.tables, duration_s)
-        self._go(motions, duration_s, wait)
+        return motions
 
     def _follow(self, times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, wait: bool) -> None:
         """Of all joints along splines through the rows of `positions_rad`, shape (n, axes)."""
@@ -254,21 +264,25 @@ class Program:
             trajectory[0].kind, trajectory[0].table_rows = TrajectoryKind.TABLE, len(table)
             with blamed(name):
                 motions.append(NewMotion(trajectory, checked_motion(config, trajectory[0], table)))
-        duration_s = float(tables[0, -1, 0])
-        self._require_torques(motions, tables, duration_s)
+        self._require_torques(motions, tables, float(tables[0, -1, 0]))
         starts_rad = self._at_rest()
-        self._motor.tables[:, : tables.shape[1]] = tables
         ways = zip(self._motor.constants, tables[:, 0, 1] - starts_rad, strict=True)
         move_s = max(float(plain(move_duration_s)(axis.change, way)) for axis, way in ways)
-        self._go(motions, duration_s, wait, move_s)
+        if move_s > 0.0 and self._axes.arm is not None:
+            way = self._moves(starts_rad, tables[:, 0, 1].tolist(), move_s)
+            self._require_torques(way, tables, move_s, "the way to the beginning of the table")
+        self._motor.tables[:, : tables.shape[1]] = tables
+        self._go(motions, wait, move_s)
 
-    def _require_torques(self, motions: Sequence[NewMotion], tables: np.ndarray, duration_s: float) -> None:
+    def _require_torques(
+        self, motions: Sequence[NewMotion], tables: np.ndarray, duration_s: float, what: str = "the motion"
+    ) -> None:
         """`ConfigurationError` where the arm's model asks more of a joint than its limit on the way."""
         if self._axes.arm is not None:
             from jointctl.tools.analysis.arm_check import require_torques
 
             trajectories = [motion.trajectory[0] for motion in motions]
-            require_torques(self._axes.arm, trajectories, tables, duration_s, self._alive)
+            require_torques(self._axes.arm, trajectories, tables, duration_s, self._alive, what)
 
     def _command(self, values: SetPointValues, time_s: float | None) -> None:
         stream = self._following()
@@ -288,26 +302,38 @@ class Program:
         if self._motor.constants[0].trajectory.kind == TrajectoryKind.TABLE:  # its rows may be written again
             holds = self._motor.constants["trajectory"].copy()
             holds["kind"], holds["start_rad"] = TrajectoryKind.STREAM, rest_rad
-            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))], 0.0, True)
+            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))], True)
         return rest_rad
 
     @property
     def _under_way(self) -> bool:
         """Whether a motion that was asked for has not come to its end."""
-        for constants, state in zip(self._motor.constants, self._motor.axis, strict=True):
+        motor = self._motor
+        for constants, state, table in zip(motor.constants, motor.axis, motor.tables, strict=True):
             if state.change.motion != MotionChange.NONE:
                 return True
-            if constants.trajectory.kind != TrajectoryKind.STREAM and state.trajectory_s < self._lasts_s:
+            trajectory = constants.trajectory  # the loop's own, also where an exception has ended the call
+            lasts_s = (
+                table[trajectory.table_rows - 1, 0] if trajectory.kind == TrajectoryKind.TABLE else trajectory.move_s
+            )
+            if trajectory.kind != TrajectoryKind.STREAM and state.trajectory_s < lasts_s:
                 return True
         return False
 
-    def _go(self, motions: Sequence[NewMotion], duration_s: float, wait: bool, move_s: float = 0.0) -> None:
+    def _go(self, motions: Sequence[NewMotion], wait: bool, move_s: float = 0.0) -> None:
         self._alive()
         self._motor.post(motions, move_s)
-        self._lasts_s = duration_s
         while wait and self._under_way:
             self._alive()
             self._motor.wait(POLL_S)
+
+
+def _answer(approve: Callable[[Sequence[str]], bool], lines: Sequence[str]) -> bool:
+    """What `approve` says; what only counts as true, as the text "n" does, is no consent."""
+    answer = approve(lines)
+    if not isinstance(answer, (bool, np.bool_)):
+        raise UsageError(f"approve (={one_line(repr(answer))[:40]}) must return True or False; nothing has moved")
+    return bool(answer)
 
 
 def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: int) -> np.ndarray:
@@ -322,7 +348,7 @@ def spline_tables(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike, axes: in
     try:
         if any(np.asarray(array).dtype.kind in "bcmMSU" for array in given):  # times of a calendar count nanoseconds
             raise TypeError
-        times, positions = (np.asarray(array, np.float64) for array in given)
+        times, positions = (np.ma.asarray(array, np.float64).filled(np.nan) for array in given)
     except (TypeError, ValueError):
         raise ConfigurationError("times_s and positions_rad must be arrays of numbers") from None
     wanted = (len(times),) if positions.ndim == 1 and axes == 1 else (len(times), axes) if times.ndim else ()

@@ -199,6 +199,50 @@ def test_a_forked_process_neither_moves_nor_ends_it(bench: Any) -> None:
     assert bench.disabled()
 
 
+UNLEFT = """
+import sys, threading
+import jointctl
+
+joint = jointctl.Joint("joint.toml").__enter__()
+{body}
+print("the end", file=sys.stderr, flush=True)
+"""
+DAEMON = """
+joint.enable()
+def back_and_forth():
+    while True:
+        joint.move_to(0.1, duration_s=1.0)
+        joint.move_to(0.0, duration_s=1.0)
+threading.Thread(target=back_and_forth, daemon=True).start()
+joint.wait(1.5)
+"""
+
+
+@pytest.mark.parametrize("body", ["", DAEMON], ids=["commissioned", "moved by a daemon thread"])
+def test_a_program_that_ends_without_leaving_the_block_leaves_nothing_running(bench: Any, body: str) -> None:
+    config = bench.config(stream__client_timeout_s=3.0)
+    bench.joint(config)
+    program = bench.program(UNLEFT.format(body=body)).saw("the end")
+    assert program.finished(20.0).code == 0
+    if body:
+        assert any("asked for by the end of the program" in event.text for event in bench.log().events)
+        assert phases(bench)[-5:] == RAMPED
+    assert bench.disabled()
+
+
+def test_a_program_that_goes_on_after_a_fault_learns_that_its_drive_may_be_on(bench: Any) -> None:
+    drive = bench.joint_process(bench.config())
+    body = """
+    try: joint.wait(60.0)
+    except jointctl.MotionFault: say("fault")
+    """
+    program = bench.program(PROGRAM.format(body=body.strip(), approve="")).saw("enabled")
+    drive.end()
+    ended = program.saw("fault").finished(30.0)
+    assert "DeviceError: the drive did not confirm that it is off" in ended.err
+    assert "left" not in ended.err.split()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -190,11 +190,13 @@ def moments_s(duration_s: float) -> np.ndarray:
 
 
 def require_torques(
-    arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None]
-) -> None:
+    arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None],
+    what: str = "the motion",
+) -> None:  # fmt: skip
     """`ConfigurationError` where the model asks more of a joint than its limit, at one of `MOTION_SAMPLES` moments.
 
-    `trajectories`: TrajectoryConstants of each joint, `tables` their rows; `alive` is called in between.
+    `trajectories`: TrajectoryConstants of each joint, `tables` their rows; `alive` is called in between;
+    `what` they are.
     """
     memory = arm.model.memory()
     motion: Any = memory.motion
@@ -216,7 +218,7 @@ def require_torques(
         worst, limit_Nm = int(np.argmax(np.abs(torques))), config.limits.torque_max_Nm
         if not abs(torques[worst]) <= limit_Nm:
             raise ConfigurationError(
-                f"{name}: the motion takes {torques[worst]:.3g} Nm at {times_s[worst]:.3g} s by the arm's model, "
+                f"{name}: {what} takes {torques[worst]:.3g} Nm at {times_s[worst]:.3g} s by the arm's model, "
                 f"must be in [{-limit_Nm:g}..{limit_Nm:g}], limits.torque_max_Nm"
             )
 

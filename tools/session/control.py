@@ -14,6 +14,7 @@ from types import FrameType
 
 from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
+from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -110,7 +111,11 @@ def _wake_main() -> None:
 
 @contextmanager
 def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
-    """Collect stop signals while the block runs instead of ending the program."""
+    """Collect stop signals while the block runs instead of ending the program; `UsageError` in another thread."""
+    if threading.current_thread() is not threading.main_thread():
+        raise UsageError(
+            "this takes over Ctrl-C, which Python allows in the main thread only", "call it there; a Joint may have any"
+        )
     signals = StopSignals(raising=raising)
     before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
     try:
@@ -207,6 +212,16 @@ def control_of(interface: str, channel: str, output: Output, within_s: float = S
         yield control
 
 
+def _require_no_copy() -> None:
+    """`UsageError` while multiprocessing, to start a process, runs the file of a program again: it would move twice."""
+    process = sys.modules.get("multiprocessing.process")
+    if process is not None and getattr(process.current_process(), "_inheriting", False):
+        raise UsageError(
+            "a process that multiprocessing starts runs this file again from its first line; it controls no drive",
+            'put what moves a joint below `if __name__ == "__main__":`',
+        )
+
+
 @contextmanager
 def _locked(
     places: Sequence[tuple[str, str]], output: Output, within_s: float, signals: StopSignals
@@ -215,6 +230,7 @@ def _locked(
 
     A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.
     """
+    _require_no_copy()
     words = "; nothing moved"  # until the program has its locks
     try:
         with ExitStack() as stack:

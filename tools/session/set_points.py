@@ -31,6 +31,7 @@ from jointctl.tools.session.loop_memory import SharedBlock
 from jointctl.tools.session.plan import Placed
 
 TELL_S = 1.0  # how often refusals are reported, at most
+LATEST_S = 4e9  # of a program's clock, either way: the loop counts nanoseconds in 64 bits
 MOST_SOURCES = 16  # whose refusals are counted one by one in a report
 
 
@@ -299,7 +300,10 @@ class SetPointStream:
     def _time_of(self, time_s: float | None, now_ns: int, last_ns: int | None) -> int:
         """Time of the set-point [ns]; calls without a time are taken as even, at the rate of the last ones."""
         if time_s is not None:
-            given_ns = round(finite("time_s", time_s) * 1e9)
+            (given_s,) = vector("time_s", time_s, ("",))
+            if not abs(given_s) <= LATEST_S:
+                raise SetPointError(f"time_s (={given_s:g}) must be in [{-LATEST_S:g}..{LATEST_S:g}]")
+            given_ns = round(given_s * 1e9)
             if self._offset_ns is None or last_ns is None:
                 self._offset_ns = now_ns - given_ns
             return given_ns + self._offset_ns

@@ -215,12 +215,30 @@ def test_what_the_arms_model_asks_on_the_way_is_within_the_torque_limits(limit_N
         assert (arm.state.desired_position_rad == before).all()
 
 
+@pytest.mark.parametrize(("limit_Nm", "allowed"), [(28.0, False), (70.0, True)])
+def test_nor_does_the_way_to_the_beginning_of_a_table_ask_for_more(limit_Nm: float, allowed: bool) -> None:
+    """From one upright pose to the other one, past where gravity is 32 Nm."""
+    table = [[-1.3, 0.1, 0.1]] * 2
+    with jointctl.Arm(upright(limit_Nm), lockstep=True) as arm:
+        arm.enable()
+        before = arm.state.desired_position_rad
+        if allowed:
+            arm.follow([0.0, 1.0], table)
+            return
+        words = "shoulder: the way to the beginning of the table takes .* by the arm's model"
+        with pytest.raises(jointctl.ConfigurationError, match=words):
+            arm.follow([0.0, 1.0], table)
+        arm.step(0.1)
+        assert (arm.state.desired_position_rad == before).all()
+
+
 @pytest.mark.parametrize(
     ("times", "positions", "words"),
     [
         ([0.0, 1.0], [[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]], "elbow: "),
         ([0.0, 1.0], [[0.0, 0.0], [0.0, 0.1]], r"must be \(N,\) and \(N, 3\)"),
         ([0.0, 1.0], [[0.0, 0.0, 0.0], [0.0, 0.1, math.nan]], r"positions_rad\[1, 2\]"),
+        ([0.0, 1.0], np.ma.masked_equal([[0.0, 0.0, 0.0], [0.0, 0.1, 9.0]], 9.0), r"positions_rad\[1, 2\]"),
         ([1.0, 1.0], [[0.0, 0.0, 0.0], [0.0, 0.1, 0.1]], r"times_s\[1\]"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 
 import jointctl
+from jointctl.firmware_py.states import AxisPhase
 from jointctl.joint import Joint, SetPointError
 
 RATE_Hz = 100.0
@@ -115,9 +116,19 @@ def test_times_must_ascend_without_a_gap(joint: Joint) -> None:
     at_rad = joint.state.desired_position_rad
     joint.command(at_rad, 0.0, time_s=7.0)
     joint.step(0.01)
-    for time_s in (7.0, 6.9, 7.5):
+    for time_s in (7.0, 6.9, 7.5, 4e9):
         with pytest.raises(SetPointError, match="after the set-point before"):
             joint.command(at_rad, 0.0, time_s=time_s)
+    joint.command(at_rad, 0.0, time_s=7.01)
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, 1e12, -1e300, "7.01"])
+def test_a_time_that_is_none_refuses_the_set_point(joint: Joint, time_s: float) -> None:
+    at_rad = joint.state.desired_position_rad
+    joint.command(at_rad, 0.0, time_s=7.0)
+    joint.step(0.01)
+    with pytest.raises(SetPointError, match=r"time_s .* must be in \[-4e\+09..4e\+09\]|made of numbers"):
+        joint.command(at_rad, 0.0, time_s=time_s)
     joint.command(at_rad, 0.0, time_s=7.01)
 
 
@@ -151,6 +162,31 @@ def test_a_motion_waits_for_the_one_before_and_set_points_are_for_rest(joint: Jo
     assert joint.state.desired_position_rad == pytest.approx(0.0, abs=1e-12)
 
 
+def test_a_motion_whose_call_was_interrupted_is_under_way_all_the_same(
+    joint: Joint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program may go on after Ctrl-C: no set-point is taken meanwhile, and the next motion waits."""
+    times = np.linspace(0.0, 2.0, 21)
+    post = joint._motor.post
+
+    def interrupted(*motion: Any) -> None:
+        post(*motion)
+        raise KeyboardInterrupt
+
+    joint.move_to(0.0, duration_s=0.5)
+    with monkeypatch.context() as patched:
+        patched.setattr(joint._motor, "post", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            joint.follow(times, np.zeros(21))
+    joint.step(1.0)
+    with pytest.raises(SetPointError, match="a motion is under way"):
+        joint.command(0.0)
+    joint.follow(times, 0.2 * np.sin(np.pi * times / 4.0) ** 2)
+    assert joint.state.desired_position_rad == pytest.approx(0.2)
+    moved = joint.records.desired_position_rad[joint.records.phase == AxisPhase.TRACKING]
+    assert np.abs(np.diff(moved)).max() < 1e-3
+
+
 def test_a_table_is_followed_twice(joint: Joint) -> None:
     times = np.linspace(0.0, 2.0, 21)
     for amplitude_rad in (0.1, -0.1):
@@ -170,6 +206,7 @@ def test_a_table_is_followed_twice(joint: Joint) -> None:
         ([0.0, 1.0], ["0.1", "0.1"], "numbers"),
         (np.array(["2026-11-27", "2026-11-28"], "datetime64[ns]"), [0.1, 0.1], "numbers"),
         ([0.0, 1.0], np.array([0.1j, 0.1]), "numbers"),
+        ([0.0, 1.0, 2.0], np.ma.array([0.1, 0.2, 0.1], mask=[0, 1, 0]), r"positions_rad\[1\] \(=nan\)"),
         ([0.0, 1e13], [0.1, 0.1], "lasts 1e[+]13 s, must be at most 100000 s"),
     ],
 )
@@ -241,8 +278,36 @@ def test_approve_has_the_last_word() -> None:
     assert joint.state.phase == "commissioned"
 
 
+async def asked_later(lines: Sequence[str]) -> bool:
+    return False
+
+
+@pytest.mark.parametrize("approve", [lambda lines: "n", lambda lines: None, lambda lines: 1, asked_later])
+@pytest.mark.filterwarnings("ignore:coroutine")
+def test_what_only_counts_as_true_is_no_consent(approve: Any) -> None:
+    with (
+        Joint("virtual", lockstep=True) as joint,
+        pytest.raises(jointctl.UsageError, match=r"must return True or False"),
+    ):
+        joint.enable(approve=approve)
+    assert joint.state.phase == "commissioned"
+
+
+def test_a_joint_is_for_one_block() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        with pytest.raises(jointctl.UsageError, match="begin a new Joint"), joint:
+            pass
+        joint.enable()
+    with pytest.raises(jointctl.UsageError, match="begin a new Joint"), joint:
+        pass
+
+
 def test_without_enable_nothing_is_followed() -> None:
     with Joint("virtual", lockstep=True) as joint:
+        joint.step(2.0)
+        assert (joint.state.phase, joint.state.drive_state) == ("waiting", "switch on disabled")
+        with pytest.raises(jointctl.MotionFault, match="follows nothing"):
+            joint.step_torque(1.0)
         for call in (lambda: joint.move_to(0.1), lambda: joint.command(0.1)):
             with pytest.raises(jointctl.UsageError, match="enable"):
                 call()

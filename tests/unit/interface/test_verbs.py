@@ -7,6 +7,7 @@ import inspect
 import runpy
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from jointctl.tools.inspection.health import PROBLEM, Finding
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.verbs.verb_options import ResultOutput
+from tests.configurations import written
 from tests.places import CONFIGS
 
 
@@ -57,6 +59,67 @@ def test_the_processes_of_a_study_do_not_run_the_users_program_again(tmp_path: P
     )
     done = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300.0)
     assert (done.stdout, done.returncode) == ("once\n(3,)\n", 0), done.stderr
+
+
+COPIED = """
+import sys, multiprocessing
+import jointctl
+
+def tried(call):
+    try:
+        call()
+    except jointctl.JointctlError as error:
+        print(__name__, type(error).__name__, flush=True)
+
+tried(jointctl.Joint("joint.toml").__enter__)
+tried(lambda: jointctl.run("joint.toml", yes=True, quiet=True))
+process = multiprocessing.get_context(sys.argv[1]).Process(target=print)
+process.start()
+process.join()
+"""
+
+
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_nor_does_a_process_of_the_program_itself_move_the_joint_again(tmp_path: Path, method: str) -> None:
+    """Python runs the file from its first line there, where no condition on `__name__` keeps it from that."""
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    (tmp_path / "program.py").write_text(COPIED)
+    command = [sys.executable, "-P", "program.py", method]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300.0)
+    assert done.stdout == "__main__ BusError\n" * 2 + "__mp_main__ UsageError\n" * 2, done.stderr
+
+
+CLOSED = """
+import os
+import jointctl
+
+for descriptor in range(3):
+    os.close(descriptor)
+try:
+    {call}
+except jointctl.JointctlError as error:
+    found = [os.fstat(descriptor).st_rdev == os.stat(os.devnull).st_rdev for descriptor in range(3)]
+    open("found.txt", "w").write(f"{{type(error).__name__}} {{found}}")
+"""
+
+
+@pytest.mark.parametrize(
+    "call", ['jointctl.Joint("joint.toml").__enter__()', 'jointctl.run("joint.toml", yes=True, quiet=True)']
+)
+def test_what_a_program_prints_behind_closed_streams_does_not_land_in_a_bus(tmp_path: Path, call: str) -> None:
+    """As one does that has made a daemon of itself: the next socket would get the number of its standard output."""
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    (tmp_path / "program.py").write_text(CLOSED.format(call=call))
+    subprocess.run([sys.executable, "-P", "program.py"], cwd=tmp_path, timeout=300.0, check=True)
+    assert (tmp_path / "found.txt").read_text() == "BusError [True, True, True]"
+
+
+def test_what_moves_a_joint_is_refused_in_another_thread_in_words(tmp_path: Path) -> None:
+    written(tmp_path / "joint.toml", "virtual", bus__channel=str(tmp_path / "no-one"))
+    with ThreadPoolExecutor(1) as threads:
+        done = threads.submit(jointctl.run, tmp_path / "joint.toml", yes=True, quiet=True)
+        with pytest.raises(jointctl.UsageError, match="in the main thread only"):
+            done.result()
 
 
 def test_check_gives_the_margins() -> None:
