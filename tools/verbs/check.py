@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -136,8 +137,9 @@ def check_cascade(
     for loop in found:
         notes = [f"worst case: {loop.joint}"] if loop.joint else []
         if loop.stable:
-            notes = [f"at {loop.crossover_Hz:.1f} Hz", f"gain margin x {loop.gain_margin_up:.3g}", *notes]
-        value = f"{loop.phase_margin_deg:.1f} deg phase margin" if loop.stable else "UNSTABLE"
+            where = [] if math.isnan(loop.crossover_Hz) else [f"at {loop.crossover_Hz:.1f} Hz"]
+            notes = [*where, f"gain margin x {loop.gain_margin_up:.3g}", *notes]
+        value = loop.phase_text(1) if loop.stable else "UNSTABLE"
         table.add_row(loop.name, value, "; ".join(notes))
     for row in bench_of(config).check_rows(config):
         table.add_row(*row)
