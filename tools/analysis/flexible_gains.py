@@ -4,6 +4,7 @@ The least error of the link after a step of friction at the motor, subject to
 
     |S| <= LARGEST_S with the joint as it is believed, <= LARGEST_S_ANYWHERE with every one of `LoopSettings.joints`
     torque noise of the encoders' counts <= LARGEST_NOISE_Nm
+    phase margin and |S| as the margin gate asks for, of the joints that are free of friction
 
 Searched by Nelder and Mead over kv and the observer's bandwidth; with the link's encoder alone, where the resonance
 lies between torque and encoder, over the velocity's cut-off too, and so where both encoders are read but bear only a
@@ -24,6 +25,7 @@ import numpy as np
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import ControllerKind, Encoders
 from jointctl.tools.analysis.linear_loop import Array, ComplexArray, LinearLoop, LoopSettings, TwoMasses, linear_loop
+from jointctl.tools.analysis.margins import phase_on_grid_rad
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
 
@@ -37,6 +39,7 @@ SOFT_KV_1ps = 12.0
 WORTH_A_FILTER = 1.35  # by how much smaller the error must be: what repeats is learned badly behind one
 KP_OF_KV = 1.5
 MOTOR_ERROR = 0.15
+GATE_SLACK = 1.03  # by which more is searched for than the gate asks for, whose frequencies are closer
 ROUNDED = 1.02  # by which a constraint may be missed, as the search ends near it
 HIGHEST_CUTOFF = 0.45  # of the rate
 PENALTY = 20.0  # on the logarithm of the error, for each unit by which a constraint is missed
@@ -77,6 +80,11 @@ class FlexibleGains:
         gains = {"kp": self.kp, "kv": self.kv, "observer_radps": self.observer_radps}
         return gains if self.cutoff_Hz is None else {**gains, "velocity_cutoff_Hz": self.cutoff_Hz}
 
+    def loop(self, settings: LoopSettings) -> LoopSettings:
+        """The loop with them."""
+        cutoff_Hz = settings.cutoff_Hz if self.cutoff_Hz is None else self.cutoff_Hz
+        return replace(settings, kp=self.kp, kv=self.kv, observer_radps=self.observer_radps, cutoff_Hz=cutoff_Hz)
+
 
 @dataclass(frozen=True)
 class _Judged:
@@ -85,17 +93,19 @@ class _Judged:
     s_anywhere: float
     noise_Nm: float
     beyond: float  # logarithm of the observer's bandwidth over the largest one, or of the least kv over kv
+    refused: float  # by which share the gate misses phase margin or sensitivity
 
     @property
     def cost(self) -> float:
         missed = max(self.s - LARGEST_S, 0.0) + max(self.s_anywhere - LARGEST_S_ANYWHERE, 0.0) + self.beyond
+        missed += self.refused
         return math.log(self.error) + PENALTY * (missed + max(self.noise_Nm / LARGEST_NOISE_Nm - 1.0, 0.0))
 
     @property
     def kept(self) -> bool:
         """Whether the constraints are, but for where the search ends."""
         shares = self.s / LARGEST_S, self.s_anywhere / LARGEST_S_ANYWHERE, self.noise_Nm / LARGEST_NOISE_Nm
-        return max(*shares, math.exp(self.beyond)) <= ROUNDED
+        return max(*shares, math.exp(self.beyond), 1.0 + self.refused) <= ROUNDED
 
     def gain_on(self, other: _Judged) -> float:
         """By how much the error of `other` is greater; what it misses counts where one of them misses anything."""
@@ -114,12 +124,14 @@ def _with_gains(settings: LoopSettings, logarithms: Array) -> LoopSettings:
 class _Search:
     """Responses of the joints, which no gain changes."""
 
-    def __init__(self, settings: LoopSettings, count_rad: Array) -> None:
+    def __init__(self, settings: LoopSettings, count_rad: Array, least_phase_deg: float) -> None:
         self._settings, self._count_rad = settings, count_rad
+        self._least_phase_rad = math.radians(least_phase_deg * GATE_SLACK)
         self._omega = np.geomspace(math.tau * _LOWEST_Hz[settings.encoders], math.pi / settings.period_s, _POINTS)
         self._z = np.exp(1j * self._omega * settings.period_s)
         masses = [joint for joint in settings.joints if isinstance(joint, TwoMasses)]
         free = [joint for joint in masses if joint.bristle_Nmprad == (0.0, 0.0)]
+        self._of_gate = len(free)
         wrong = (1.0 - MOTOR_ERROR, 1.0 + MOTOR_ERROR)
         free += [replace(joint, motor_kgm2=factor * joint.motor_kgm2) for joint in free for factor in wrong]
         self._joints = [linear_loop(replace(settings, joints=(joint,))).joint for joint in free]
@@ -137,8 +149,9 @@ class _Search:
         for joint, response in zip(self._joints, self._responses, strict=True):
             radius = float(np.max(np.abs(LinearLoop(settings, joint, controller).closed_loop_poles())))
             if radius >= 1.0:
-                return _Judged(UNSTABLE, UNSTABLE * radius, UNSTABLE * radius, 0.0, 0.0)
+                return _Judged(UNSTABLE, UNSTABLE * radius, UNSTABLE * radius, 0.0, 0.0, 0.0)
             largest.append(float(np.max(np.abs(self._sensitivity(law, response)))))
+        phase_rad = min(phase_on_grid_rad(-(law @ response)[:, 0, 0]) for response in self._responses[: self._of_gate])
         response = self._responses[self._believed]
         sensitivity = self._sensitivity(law, response)
         link = self._positions[self._believed][:, 0, 0]
@@ -152,6 +165,12 @@ class _Search:
             beyond=max(
                 math.log(settings.observer_radps / LARGEST_OBSERVER_radps), math.log(LEAST_KV_1ps / settings.kv), 0.0
             ),
+            refused=max(
+                self._least_phase_rad / max(phase_rad, 1e-9),
+                max(largest[: self._of_gate]) * GATE_SLACK / settings.largest_s,
+                1.0,
+            )
+            - 1.0,
         )
 
     def best_from(self, start: Array) -> LoopSettings:
@@ -182,7 +201,7 @@ def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
             f'{config.path}: gains are chosen for control.kind = "flexible_joint" (={config.control.kind}) only'
         )
     counts_rad = np.array([law_resolution_rad(config), abs(joint_rad_per_count(config))])  # link, motor
-    search = _Search(settings, counts_rad[_COLUMNS[settings.encoders]])
+    search = _Search(settings, counts_rad[_COLUMNS[settings.encoders]], config.margin.min_phase_margin_deg)
     found = search.best_from(_START[settings.encoders])
     if settings.encoders == Encoders.BOTH and found.kv < SOFT_KV_1ps:
         filtered = search.best_from(_START_FILTERED)

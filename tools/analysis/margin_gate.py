@@ -29,6 +29,7 @@ from jointctl.tools.analysis.margins import (
 )
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
+from jointctl.tools.configuration.records import encoders_of_law
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.canopen import CanopenSection, Cascade
@@ -291,12 +292,17 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
 #
 # P is the shaft that the drive's encoder sits on over torque, 1 / (J s^2) of a rigid joint.  With [reducer] it is that
 # of two masses, for each of the joints that the margins of a law are worked out for, and R is the shaft that feeds the
-# law over that of the drive's encoder (CSV; else 1): the worst joint counts.  Without the offsets, which are outside
-# the loops; a rigid joint also without friction, which only adds damping.
+# law over that of the drive's encoder (CSV; else 1): the worst joint counts.  In CSP with both encoders the target has
+# what the twist is away from the expected one taken off, on the PC and twist_radps = wb quick:
+#
+#     twist correction   Lt = wb / (s + wb)  (link / motor - 1)  Lp / (1 + Lp) e^(-s Tt)     Tt: our delay and a period
+#
+# Without the offsets, which are outside the loops; a rigid joint also without friction, which only adds damping.
 # Not modelled: the drive's filters and its estimation of the velocity.
 
 _LOWEST_radps, _POINTS = 1e-2, 20_000
 _LEAST_DAMPING = 0.002  # of the critical one, of a reducer: a resonance without any falls between two points
+TWIST = "twist correction"
 SAMPLES_LATE = 1.5  # of a sampled loop: one to compute, half for holding
 
 
@@ -310,6 +316,12 @@ class LoopMargin:
     gain_margin_up: float  # inf: no gain makes it unstable
     stable: bool
     joint: str = ""  # the worst one, of several
+
+    def phase_text(self, digits: int) -> str:
+        """The phase margin in words; of a loop whose gain stays below 1 there is none."""
+        if math.isinf(self.phase_margin_deg):
+            return "a gain below 1"
+        return f"{self.phase_margin_deg:.{digits}f} deg phase margin"
 
 
 def _margin(name: str, omega: np.ndarray, response: np.ndarray, inner_stable: bool = True) -> LoopMargin:
@@ -364,7 +376,14 @@ def cascade_margins(config: Config, delay_s: float) -> list[LoopMargin]:
     soft = [joint for joint in loop_settings(config, delay_s)[0].joints if isinstance(joint, TwoMasses)]
     joints: list[TwoMasses | None] = [*soft] or [None]
     of_each = [_cascade_margins(config, delay_s, joint) for joint in joints]
-    return [min(loops, key=lambda loop: (loop.stable, loop.phase_margin_deg)) for loops in zip(*of_each, strict=True)]
+    return [
+        min(loops, key=lambda loop: (loop.stable, loop.phase_margin_deg, loop.gain_margin_up))
+        for loops in zip(*of_each, strict=True)
+    ]
+
+
+def _corrects_twist(config: Config) -> bool:
+    return config.control.kind == "flexible_joint" and encoders_of_law(config) == Encoders.BOTH
 
 
 def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) -> list[LoopMargin]:
@@ -394,6 +413,12 @@ def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) ->
     if cascade.position_gain_ps is not None:
         position = cascade.position_gain_ps / s * closed * (fed / own) * np.exp(-s * late_s)
         found.append(_margin("position loop", omega, position, all(loop.stable for loop in found)))
+        if kind is CommandKind.POSITION and joint is not None and _corrects_twist(config):
+            twist = shafts["joint"] / shafts["motor"] - 1.0  # of the link against a motor that follows its target
+            late = np.exp(-s * (delay_s + 1.0 / config.loop.rate_Hz))  # the drive goes to a target within a period
+            correction = config.control.twist_radps / (s + config.control.twist_radps) * twist * late
+            correction *= position / (1.0 + position)
+            found.append(_margin(TWIST, omega, correction, all(loop.stable for loop in found)))
     return found if joint is None else [replace(loop, joint=joint.name) for loop in found]
 
 
@@ -418,7 +443,9 @@ def require_cascade(config: Config, delay_s: float, *, allow_low_margin: bool = 
                 f"drive.mode (={_section(config).mode}): the phase margin of the {loop.name} "
                 f"(={loop.phase_margin_deg:.1f} deg{'' if loop.stable else ', unstable'}) must be at least "
                 f"{minimum_deg:g} deg{f'; worst case: {loop.joint}' if loop.joint else ''}",
-                "correct the gains in [drive.cascade], and those of the drive with its maker's software",
+                f"a lower control.twist_radps (now {config.control.twist_radps:g})"
+                if loop.name == TWIST
+                else "correct the gains in [drive.cascade], and those of the drive with its maker's software",
             )
     return found
 
@@ -428,4 +455,4 @@ def cascade_text(config: Config, delay_s: float, *, allow_low_margin: bool = Fal
     found = require_cascade(config, delay_s, allow_low_margin=allow_low_margin)
     if not found:
         return "the drive closes its own loops, whose gains are not given"
-    return ", ".join(f"{loop.name} with {loop.phase_margin_deg:.0f} deg phase margin" for loop in found)
+    return ", ".join(f"{loop.name} with {loop.phase_text(0)}" for loop in found)

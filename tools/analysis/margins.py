@@ -219,6 +219,15 @@ def worst_case(settings: LoopSettings) -> LoopSettings:
     return _worst_cases(settings)[0]
 
 
+def phase_on_grid_rad(open_loop: np.ndarray) -> float:
+    """The phase margin between the frequencies of a response that is close enough, the loop being stable."""
+    logarithm = np.log(np.abs(open_loop))
+    i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
+    share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
+    crossing = (1.0 - share) * open_loop[i] + share * open_loop[i + 1]
+    return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi))
+
+
 def _worst_cases(settings: LoopSettings) -> tuple[LoopSettings, LoopSettings]:
     """That one, and the joint with the highest peak of |S|, which means something where all are stable."""
     found = cases(settings)
@@ -234,12 +243,7 @@ def _worst_cases(settings: LoopSettings) -> tuple[LoopSettings, LoopSettings]:
         if radius >= 1.0:
             return 0.0, -radius, 0.0
         response = -(law @ loop.joint.response(z))[:, 0, 0]
-        logarithm = np.log(np.abs(response))
-        i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
-        share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
-        crossing = (1.0 - share) * response[i] + share * response[i + 1]
-        closest = float(np.min(np.abs(1.0 + response)))
-        return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi)), 0.0, closest
+        return phase_on_grid_rad(response), 0.0, float(np.min(np.abs(1.0 + response)))
 
     ranks = [rank(case) for case in found]
     return found[ranks.index(min(ranks))], found[int(np.argmin([closest for _, _, closest in ranks]))]

@@ -70,7 +70,7 @@ class Wave:
     amplitude_half: float
     phase_rad: float
     phase_half_rad: float
-    found: bool  # more than noise, and each half of the turns is better predicted from the other with it
+    found: bool  # more than its interval, and each half of the turns is better predicted from the other with it
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _waves(parts: np.ndarray, *errors: float) -> tuple[Wave, ...]:
         turn = math.hypot(along, across)
         along_half, across_half = (math.hypot(max(width * float(one), turn), doubt[k]) for one in (along, across))
         half = across_half / amplitude if amplitude > 0.0 else math.pi
-        least = max(_LARGEST_SPREAD * turn / math.sqrt(count), math.hypot(width * along, doubt[k]))
+        least = max(_LARGEST_SPREAD * turn / math.sqrt(count), along_half)
         waves.append(
             Wave(
                 k + 1, float(amplitude), along_half, float(np.angle(mean)), min(half, math.pi),

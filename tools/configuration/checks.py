@@ -15,6 +15,7 @@ SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled
 LARGEST_SHARE = 0.9  # of the friction that may go with the angle
 LARGEST_SLOPE = 0.5  # of the kinematic error against the angle: beyond 1 the link would turn against the motor
 ANOTHER_UNIT = 10.0  # factor between two values of the same thing beyond which one is in another unit
+LIGHTEST_MOTOR = 0.001  # of the joint's inertia; with 1 : 32 and more, that of the motor itself is less
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -217,7 +218,9 @@ def _reducer_problems(config: Config) -> list[str]:
     found = []
     low, high = config.margin.payload_range
     if not low <= 1.0 <= high:
-        found.append(f"margin.payload_range (=[{low:g}, {high:g}]) must be two factors with 1 between them")
+        found.append(
+            f"margin.payload_range (=[{low:g}, {high:g}]) must be two factors in ascending order with 1 between them"
+        )
     if reducer.motor_inertia_kgm2 >= config.joint.inertia_kgm2:
         found.append(
             f"reducer.motor_inertia_kgm2 (={reducer.motor_inertia_kgm2:g}) must be less than joint.inertia_kgm2 "
@@ -266,6 +269,16 @@ def _unit_problems(config: Config, reducer: Reducer) -> list[str]:
     """What is so far from the rest that it is in another unit: `check` would not see the resonance."""
     softest, stiffest = reducer.stiffness_Nmprad, max((reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad))
     loop, second, found = reducer.loop_stiffness_Nmprad, config.joint_encoder, []
+    if reducer.motor_inertia_kgm2 < (least := LIGHTEST_MOTOR * config.joint.inertia_kgm2):
+        found.append(
+            f"reducer.motor_inertia_kgm2 (={reducer.motor_inertia_kgm2:g}) must be at least {least:g}, "
+            f"{LIGHTEST_MOTOR:g} of joint.inertia_kgm2: it is at the joint, that of the motor times the ratio squared"
+        )
+    if stiffest > ANOTHER_UNIT * softest:
+        found.append(
+            f"reducer.stiffness_beyond_Nmprad (={list(reducer.stiffness_beyond_Nmprad)}) must be at most "
+            f"{ANOTHER_UNIT * softest:g}, {ANOTHER_UNIT:g} times reducer.stiffness_Nmprad (={softest:g})"
+        )
     if loop is not None and loop > ANOTHER_UNIT * stiffest:
         found.append(
             f"reducer.loop_stiffness_Nmprad (={loop:g}) must be at most {ANOTHER_UNIT * stiffest:g}, "

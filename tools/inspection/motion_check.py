@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import eased, spline_table
+from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.margin_gate import meets
+from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
     joint_rad_per_count,
@@ -37,6 +40,8 @@ from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lin
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
+TRAVEL_OF_RANGE = 0.25  # at most, of the position limits' range, where a soft reducer takes more
+LONGER = 1.3  # from one travel that is tried to the next
 REACH = 2.5  # times the travel: where the position limits of the check are
 VELOCITY_MAX_radps = 0.5
 COUNTS_IN_VELOCITY = 2.0  # what a coarse encoder may add to it, in steps of its reading
@@ -96,7 +101,10 @@ class CheckPlan:
 
 
 def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
-    """`torque_Nm` is the user's; else twice the static friction, or a tenth of what a run may use."""
+    """`torque_Nm` is the user's; else twice the static friction, or a tenth of what a run may use.
+
+    A reducer that is not rigid may be made unstable by the spring: over a longer travel it is softer.
+    """
     limits, static_Nm = config.limits, static_friction_Nm(config)
     if torque_Nm is None:
         own_Nm = STATIC_FRICTIONS * static_Nm if static_Nm else TORQUE_SHARE * limits.torque_max_Nm
@@ -111,7 +119,16 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     travel = min(max(TRAVEL_rad, TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
     steps_radps = COUNTS_IN_VELOCITY * velocity_of_a_count_radps(config)
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
-    return CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
+    plan = CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
+    most = max(travel, min(TRAVEL_MAX_rad, TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)))
+    while plan.travel_rad < most and not _stable_enough(config_of_check(config, plan)):
+        plan = replace(plan, travel_rad=min(LONGER * plan.travel_rad, most))
+    return plan
+
+
+def _stable_enough(config: Config) -> bool:
+    """Whether the gate before enabling will let it move, as far as the loop delay is known."""
+    return meets(margins(loop_settings(config)[0]), config.margin.min_phase_margin_deg)
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
@@ -441,9 +458,12 @@ def _came_to_stand(motion: Motion) -> Finding:
 def _direction(motion: Motion, along: bool, law: str, other: str, numbers: dict[str, Any]) -> Finding:
     way = _way(motion)
     if not along:
+        both = f"{law}.direction"
+        if motion.other_ratio is not None and motion.other_ratio > 0.02:
+            both += f" and {other}.direction"
         remedy = (
-            f"if the joint turned the way that you call positive at first: {law}.direction; else drive.torque_direction"
-            "; but first make sure that no load moved it, such as gravity that joint.gravity_Nm does not state"
+            f"if the joint turned the way that you call positive at first: {both}; else drive.torque_direction; but "
+            "first make sure that no load moved it, such as gravity that joint.gravity_Nm does not state"
         )
         if motion.other_ratio is not None and motion.other_ratio < -0.02:
             remedy = f"{law}.direction: [{other}] agrees with the torque"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -78,14 +79,18 @@ def check(
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
-    if choose_gains:
-        _add_gains(table, config, settings)
+    chosen = _add_gains(table, config, settings) if choose_gains else None
     if figure is not None:
         from jointctl.tools.analysis.loop_report import save_loop_figure
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")
-    data = {**_data(analysis, figure), "learning": learning_data(learning), "warnings": warnings}
+    data = {
+        **_data(analysis, figure),
+        "learning": learning_data(learning),
+        "chosen_gains": chosen,
+        "warnings": warnings,
+    }
     output.result(table, data, analysis)
     for text in warnings:
         output.warning(text)
@@ -132,8 +137,9 @@ def check_cascade(
     for loop in found:
         notes = [f"worst case: {loop.joint}"] if loop.joint else []
         if loop.stable:
-            notes = [f"at {loop.crossover_Hz:.1f} Hz", f"gain margin x {loop.gain_margin_up:.3g}", *notes]
-        value = f"{loop.phase_margin_deg:.1f} deg phase margin" if loop.stable else "UNSTABLE"
+            where = [] if math.isnan(loop.crossover_Hz) else [f"at {loop.crossover_Hz:.1f} Hz"]
+            notes = [*where, f"gain margin x {loop.gain_margin_up:.3g}", *notes]
+        value = loop.phase_text(1) if loop.stable else "UNSTABLE"
         table.add_row(loop.name, value, "; ".join(notes))
     for row in bench_of(config).check_rows(config):
         table.add_row(*row)
@@ -199,17 +205,23 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
     return 0
 
 
-def _add_gains(table: Table, config: Config, settings: LoopSettings) -> None:
-    """What would suit the joint that [reducer] describes."""
+def _add_gains(table: Table, config: Config, settings: LoopSettings) -> dict[str, Any]:
+    """What would suit the joint that [reducer] describes, and what the gate makes of it; returns that for --json."""
     from jointctl.tools.analysis.flexible_gains import chosen_gains
+    from jointctl.tools.analysis.margin_gate import meets
+    from jointctl.tools.analysis.margins import margins
 
     gains = chosen_gains(config, settings)
-    value = ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items())
-    note = f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
-    note += (
-        "" if gains.met else ": NOT what is asked for, there are no such gains; less delay, or the other encoder too"
-    )
-    table.add_row("chosen gains", value, note)
+    found = margins(gains.loop(settings))
+    met = gains.met and meets(found, config.margin.min_phase_margin_deg)
+    note = f"phase margin {found.phase_margin_deg:.1f} deg, " if found.stable else "UNSTABLE, "
+    note += f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
+    note += "" if met else ": NOT what is asked for, there are no such gains; less delay, or the other encoder too"
+    table.add_row("chosen gains", ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items()), note)
+    return {
+        "changes": gains.changes(), "met": met, "phase_margin_deg": found.phase_margin_deg,
+        "largest_s": gains.largest_s, "noise_Nm": gains.noise_Nm,
+    }  # fmt: skip
 
 
 def learning_data(learning: Convergence | None) -> dict[str, float] | None:

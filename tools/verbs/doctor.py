@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.drivers.errors import INTERRUPTED
+from jointctl.drivers.errors import INTERRUPTED, MarginError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import JointOrVirtual, VerbOutput, Yes
 
@@ -100,7 +100,9 @@ def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool,
     from jointctl.tools.session.plan import TerminalConsent
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.session.session import Session
+    from jointctl.tools.tuning.frequency_response import motor_fed
 
+    config = motor_fed(config)  # the spring over a soft reducer would be unstable
     plan = make_plan(config, torque_Nm)
     session = Session(check_run(config, plan), TerminalConsent(output, assume_yes=assume_yes), output, control)
     try:
@@ -108,6 +110,11 @@ def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool,
     except KeyboardInterrupt:
         require_off(session.drive_state)
         raise
+    except MarginError as error:  # gains of the file are none of the check
+        softer = (
+            f"the check pulls with a law of its own: its spring is softer with less --torque (now {plan.torque_Nm:g})"
+        )
+        raise MarginError(error.message, f"{softer}, or with wider limits.position_*") from None
     if result is None:
         return never_begun(session.drive_state, output)
     require_off(result.drive_state)

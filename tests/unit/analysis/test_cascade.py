@@ -12,9 +12,11 @@ import pytest
 from scipy import signal
 
 from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_text, require_cascade
 from jointctl.tools.configuration.canopen import CanopenSection, cyclic_bus_load, rpdo_bytes
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from tests.configurations import changed, load, problems, shipped
@@ -230,3 +232,33 @@ def test_a_serial_drive_has_no_such_mode(tmp_path: Any) -> None:
     text = (CONFIGS / "elmo_serial.toml").read_text()
     found = problems(tmp_path, r'kind = "elmo_serial"', 'kind = "elmo_serial"\nmode = "csp"', text)
     assert any("drive.mode" in line for line in found)
+
+
+# --- a reducer that is not rigid: what the twist is away from the expected one is taken off the target ---
+@pytest.mark.parametrize(("twist_radps", "swings"), [(60.0, True), (10.0, False)])
+def test_a_twist_correction_that_meets_the_links_resonance_is_refused(twist_radps: float, swings: bool) -> None:
+    """The drive's loops alone have 50 deg and more, and the joint ended by LIMIT_CYCLE."""
+    slopes = {"stiffness_Nmprad": 5e3, "knees_Nm": (2.0, 6.9), "stiffness_beyond_Nmprad": (7.5e3, 9e3)}
+    truth = {f"virtual__reducer_{key}": value for key, value in slopes.items()}
+    soft = changed(
+        shipped("realistic"), **{f"reducer__{key}": value for key, value in slopes.items()}, **truth,
+        reducer__loop_stiffness_Nmprad=7750.0, reducer__damping_Nmspr=2.1, virtual__reducer_damping_Nmspr=2.1,
+        reducer__motor_inertia_kgm2=0.24, joint__inertia_kgm2=0.8, virtual__motor_side_inertia_kgm2=0.24,
+        virtual__command_delay_s=0.9e-3, margin__loop_delay_s=1.9e-3, control__twist_radps=twist_radps,
+        virtual__link_friction_share=0.05, trajectory__duration_s=8.0,
+    )  # fmt: skip
+    cascade = {"position_gain_ps": 40.0, "velocity_gain_Nmspr": 160.0, "velocity_integral_Nmprad": 8000.0}
+    section = drive_of(own_loop(**cascade))
+    drive = drive_of(soft).model_copy(update={"mode": "csp", "cascade": section.cascade})
+    config = soft.model_copy(update={"drive": drive})
+    *own, twist = cascade_margins(config, 1.9e-3)
+    assert all(loop.stable and loop.phase_margin_deg > 45.0 for loop in own)
+    assert twist.stable is not swings
+    run = LockstepJoint(config).run()
+    assert run.fault is (Fault.LIMIT_CYCLE if swings else Fault.NONE)
+    if swings:
+        with pytest.raises(MarginError, match=r"twist correction .*unstable") as caught:
+            require_cascade(config, 1.9e-3)
+        assert caught.value.hint == "a lower control.twist_radps (now 60)"
+    else:
+        assert "twist correction with a gain below 1" in cascade_text(config, 1.9e-3)

@@ -405,6 +405,13 @@ def test_gains_are_chosen_on_request_for_the_law_of_a_flexible_joint_only() -> N
     assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, observer_radps = [\d.]+ ", shown)
     shown, _, code = run_check(shipped("realistic", joint_encoder=None, encoder__side="joint"), choose_gains=True)
     assert re.search(r"chosen gains .* velocity_cutoff_Hz = [\d.]+ ", shown)  # the resonance lies between
+    chosen = json.loads(run_check(shipped("realistic"), choose_gains=True, json=True)[0])["chosen_gains"]
+    assert chosen["met"] is True
+    assert set(chosen["changes"]) == {"kp", "kv", "observer_radps"}
+    assert chosen["phase_margin_deg"] > 30.0
+    impossible = shipped("realistic", margin__min_phase_margin_deg=80.0)
+    shown, _, code = run_check(impossible, choose_gains=True)
+    assert (code, "NOT what is asked for" in shown) == (9, True)
     for other in (shipped("virtual"), rigid_law_behind_a_reducer("encoder")):
         with pytest.raises(ConfigurationError, match=r'gains are chosen for control.kind = "flexible_joint" .* only'):
             run_check(other, choose_gains=True)

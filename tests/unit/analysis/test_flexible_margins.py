@@ -23,7 +23,7 @@ from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.hil.plant import plant, step_plant
 from jointctl.tools.analysis.flexible_gains import LARGEST_S_ANYWHERE, LARGEST_NOISE_Nm, chosen_gains
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop, loop_settings
-from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import (
     cases,
     delay_margin_s,
@@ -248,8 +248,7 @@ def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any],
     gains = chosen_gains(config, settings)
     assert gains.largest_s <= LARGEST_S_ANYWHERE * 1.01
     assert gains.noise_Nm <= LARGEST_NOISE_Nm * 1.01
-    chosen = replace(settings, kp=gains.kp, kv=gains.kv, observer_radps=gains.observer_radps)
-    chosen = replace(chosen, cutoff_Hz=gains.cutoff_Hz or settings.cutoff_Hz)
+    chosen = gains.loop(settings)
     assert settings.encoders == encoders
     assert ("velocity_cutoff_Hz" in gains.changes()) is (encoders == Encoders.LINK)
     for case in cases(chosen):
@@ -258,6 +257,22 @@ def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any],
             assert found.stable
             assert found.sensitivity_peak <= gains.largest_s * 1.01  # of the same joints and more
     assert phase_margin_deg(chosen) > 20.0
+
+
+@pytest.mark.parametrize(
+    ("encoders", "wanted"),
+    [
+        (Encoders.LINK, {"margin__min_phase_margin_deg": 40.0}),
+        (Encoders.BOTH, {"margin__min_phase_margin_deg": 45.0}),
+        (Encoders.BOTH, {"margin__max_sensitivity": 1.6}),
+    ],
+)
+def test_chosen_gains_are_not_refused_by_the_gate_of_the_same_file(encoders: Encoders, wanted: dict[str, Any]) -> None:
+    usual, config = (with_encoders(believed(**changes), encoders) for changes in ({}, wanted))
+    settings, _ = loop_settings(config)
+    minimum_deg = config.margin.min_phase_margin_deg
+    assert meets(margins(chosen_gains(config, settings).loop(settings)), minimum_deg)
+    assert not meets(margins(chosen_gains(usual, loop_settings(usual)[0]).loop(settings)), minimum_deg)
 
 
 def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> None:

@@ -90,6 +90,17 @@ def test_the_interval_holds_what_friction_does_alike_to_every_turn_of_a_directio
     assert abs(found.amplitude - ERROR[4][0]) <= found.amplitude_half <= 0.02 * ERROR[4][0]
 
 
+def test_a_sine_within_its_own_interval_is_no_part_of_the_map() -> None:
+    """Of friction: it is there in one direction only, the same in every turn."""
+    made = made_run()
+    assert made.link_rad is not None
+    forwards = np.where(made.desired_radps > 0.0, 1e-5 * np.sin(6.0 * RATIO * made.motor_rad), 0.0)
+    wave = found_map(replace(made, link_rad=made.link_rad + forwards)).kinematic_rad[5]
+    assert wave.amplitude == pytest.approx(0.5e-5, rel=0.1)
+    assert wave.amplitude < wave.amplitude_half
+    assert not wave.found
+
+
 def test_what_the_links_inertia_twists_the_reducer_is_added_and_the_interval_holds_a_stiffness_that_is_wrong() -> None:
     """A link whose swing on the reducer makes 14 % of the wave of four periods."""
     omega_radps, soft = 4.0 * RATIO * SPEED, 1.8e3

@@ -58,12 +58,9 @@ def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
     path = written(tmp_path / "joint.toml", joint__inertia_kgm2=1e-18)
     with pytest.raises(MarginError, match="unstable"):
         require_margin(load_config(path))
-    path = tmp_path / "soft.toml"  # a motor of 2e-30 kg m2 beside its link ended in the solver
-    path.write_text(
-        shipped_config("realistic").read_text().replace("motor_inertia_kgm2 = 0.95", "motor_inertia_kgm2 = 1e-18")
-    )
+    soft = shipped("realistic", reducer__motor_inertia_kgm2=1e-18)  # one of 2e-30 kg m2 ended in the solver
     with pytest.raises(MarginError):
-        require_margin(load_config(path))
+        require_margin(soft)
 
 
 @pytest.mark.parametrize(

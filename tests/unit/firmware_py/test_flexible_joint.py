@@ -367,6 +367,8 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
         ({"reducer": None}, "[reducer] is missing: control.kind (=flexible_joint) needs it"),
         ({"reducer__motor_inertia_kgm2": None}, "reducer.motor_inertia_kgm2 is missing"),
         ({"reducer__motor_inertia_kgm2": 2.1}, "reducer.motor_inertia_kgm2 (=2.1) must be less than joint.inertia"),
+        ({"reducer__motor_inertia_kgm2": 6.5e-5}, "(=6.5e-05) must be at least 0.0021, 0.001 of joint.inertia_kgm2"),
+        ({"reducer__stiffness_Nmprad": 297.0}, "(=[26000.0, 31000.0]) must be at most 2970, 10 times reducer.stiff"),
         ({"reducer__knees_Nm": [25.0, 7.0]}, "reducer.knees_Nm (=[25.0, 7.0]) must be at most 2 torques in ascending"),
         ({"reducer__stiffness_beyond_Nmprad": [1e4]}, "reducer.stiffness_beyond_Nmprad (=[10000.0]) must be 2"),
         ({"reducer__stiffness_Nmprad": 3e4}, "reducer.stiffness_beyond_Nmprad (=[26000.0, 31000.0]) must rise from"),
@@ -387,7 +389,8 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
         ({"control__observer_radps": 0.0}, "control.observer_radps (=0) must be more than 0 with control.kind"),
         ({"limits__following_error_max_rad": 0.002}, "by which the reducer twists at limits.torque_max_Nm"),
         ({"limits__position_max_rad": 0.351}, "limits.position_max_rad (=0.351) must leave room for the motor"),
-        ({"margin__payload_range": [1.1, 1.4]}, "margin.payload_range (=[1.1, 1.4]) must be two factors with 1"),
+        ({"margin__payload_range": [1.1, 1.4]}, "(=[1.1, 1.4]) must be two factors in ascending order with 1"),
+        ({"margin__payload_range": [1.4, 0.7]}, "(=[1.4, 0.7]) must be two factors in ascending order with 1"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], message: str) -> None:
@@ -403,6 +406,9 @@ def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
     changes = {"reducer__loop_stiffness_Nmprad": 3e5, "joint_encoder__stiffness_Nmprad": 1800.0}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
     load_config(written(tmp_path / "joint.toml", "realistic", reducer__damping_Nmspr=232.0))
+    changes = {"reducer__motor_inertia_kgm2": 0.0022, "reducer__damping_Nmspr": 0.0}
+    load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    load_config(written(tmp_path / "joint.toml", "realistic", reducer__stiffness_Nmprad=3101.0))
     changes = {"reducer__map__kinematic_error_rad": [0.0015, 2e-4], "reducer__map__torque_ripple_Nm": [59.0, -0.9]}
     load_config(written(tmp_path / "joint.toml", "realistic", **changes))
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, MarginError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults import FaultKind
+from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
@@ -26,6 +27,8 @@ from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.inspection.motion_check import (
     CheckMotion,
     CheckPlan,
+    TRAVEL_MAX_rad,
+    TRAVEL_rad,
     config_of_check,
     judged,
     make_plan,
@@ -36,6 +39,7 @@ from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.verbs import doctor as doctor_motion_module
+from tests.configurations import changed, shipped
 from tests.made_faults import one_fault
 from tests.two_encoders import NODE, config_with
 
@@ -233,6 +237,50 @@ def test_an_interruption_does_not_hide_the_fault(
     assert ("VELOCITY_LIMIT" in told.out) is (fault is not Fault.NONE)
 
 
+class Refusing:
+    """A session that keeps its plan and is refused by the margin gate."""
+
+    plan: Any = None
+
+    def __init__(self, plan: Any, *_: Any) -> None:
+        Refusing.plan = plan
+
+    def run(self) -> None:
+        raise MarginError("phase margin (=1.0 deg) must be at least 30 deg", "control.kp = 1 (now 2)")
+
+
+def test_on_a_soft_reducer_the_spring_is_that_of_the_motor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the link it is unstable: the gate refused the check of `configs/realistic.toml`, with gains of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jointctl.tools.session.session.Session", Refusing)
+    with pytest.raises(MarginError) as caught:
+        doctor_motion_module.doctor_motion(shipped("realistic"), Output(), assume_yes=True)
+    assert caught.value.hint == (
+        "the check pulls with a law of its own: its spring is softer with less --torque (now 38.115), or with wider "
+        "limits.position_*"
+    )
+    require_margin(Refusing.plan.config)
+    assert Refusing.plan.motion.plan.travel_rad == TRAVEL_rad
+
+
+@pytest.mark.parametrize("side", ["motor", "joint"])
+def test_a_joint_that_the_spring_would_make_unstable_is_pulled_further(side: str) -> None:
+    light = shipped(
+        "realistic", joint_encoder=None, encoder__side=side, reducer__map=None, reducer__motor_inertia_kgm2=0.25,
+        virtual__motor_side_inertia_kgm2=0.25, encoder__counts_per_turn=2**19 if side == "joint" else 2**16,
+    )  # fmt: skip
+    plan = make_plan(light, None)
+    assert TRAVEL_rad < plan.travel_rad <= TRAVEL_MAX_rad
+    require_margin(config_of_check(light, plan))
+    with pytest.raises(MarginError):
+        require_margin(config_of_check(light, dataclasses.replace(plan, travel_rad=TRAVEL_rad)))
+    narrow = changed(light, limits__position_min_rad=-0.1, limits__position_max_rad=0.1)
+    assert make_plan(narrow, None).travel_rad == pytest.approx(0.05)  # a quarter of the range
+    found, _, fault = checked(light)
+    assert fault is Fault.NONE
+    assert {finding.status for finding in found.values()} == {OK}
+
+
 # --- the plan ---
 def test_figures_of_a_finding_are_plain_numbers(tmp_path: Path) -> None:
     found, _, _ = checked(config_with(tmp_path))
@@ -306,6 +354,13 @@ def test_a_load_that_the_file_does_not_state_is_taken_for_no_wrong_sign(
         else:
             assert topics in ({"direction"}, {"motion"})
         assert_gentle(config, records)
+
+
+def test_two_encoders_that_agree_with_each_other_are_turned_round_together(tmp_path: Path) -> None:
+    found, _, _ = checked(config_with(tmp_path, NODE), reverse_torque)
+    assert found["two encoders"].status == OK
+    remedy = found["direction"].remedy
+    assert ": joint_encoder.direction and encoder.direction; else drive.torque_direction" in remedy
 
 
 @pytest.mark.parametrize(("law", "wrong"), [("encoder", "encoder"), ("joint_encoder", "encoder")])
