@@ -211,7 +211,10 @@ class LiveMotor:
         if error is not None and not isinstance(error, KeyboardInterrupt):
             raise error
         if result is not None and result.faulty:
-            raise result.faulty[0].motion_fault()
+            fault = result.faulty[0].motion_fault()
+            if result.stopped_by:  # a drive that a stop has switched off, say
+                fault = MotionFault(f"{fault.message}; stopped by {result.stopped_by}", fault.hint)
+            raise fault
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", AGAIN)

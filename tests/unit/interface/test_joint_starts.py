@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -63,3 +66,16 @@ def test_a_stop_of_its_own_is_one_of_what_it_has_asked_for_before(
     stop(joint_file)
     with pytest.raises(AssertionError if before else MotionFault):
         (joint or Joint(joint_file)).__enter__()
+
+
+@pytest.mark.parametrize("by", ["", "jointctl stop"])
+def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
+    """A stop switches the drive off at once: the loop may see that before it has read the request."""
+    ended = SimpleNamespace(motion_fault=lambda: MotionFault("DRIVE_NOT_ENABLED (9): it is off", "check the wiring"))
+    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
+    motor._process, motor._thread, motor._error = os.getpid(), threading.Thread(), None
+    motor.result = SimpleNamespace(faulty=[ended], stopped_by=by)
+    with pytest.raises(MotionFault) as raised:
+        motor._raise()
+    assert raised.value.message == "DRIVE_NOT_ENABLED (9): it is off" + (f"; stopped by {by}" if by else "")
+    assert raised.value.hint == "check the wiring"
