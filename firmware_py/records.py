@@ -127,10 +127,10 @@ class AdaptationState:
     rest_disturbance_Nm: f8  # of the observer's, what it keeps at rest
     rest_friction_Nm: f8  # of the bristles, when the desired motion came to rest
     rest_error_rad: f8  # the furthest in the direction of that torque since
-    to_let_go_Nm: f8  # of that torque
+    to_let_go_Nm: f8  # what of their torque the bristles have still to give up
     resting: i4  # cycles since, 0 while it goes on
     cycle: i4
-    seen_motor: VelocityState  # of the errors of a joint that is not rigid, see `flexible_joint`
+    seen_motor: VelocityState  # from here on: not rigid, both encoders, see `flexible_joint`; rates of its errors
     seen_link: VelocityState
     seen_integral_Nms: f8  # of the observer
     seen_disturbance_Nm: f8

@@ -374,10 +374,10 @@ def motion_findings(
         yield _came_to_stand(motion)
     elif motion.along:
         yield from _friction(motion, plan)
-    explained = direction.status == PROBLEM and fault in (_STANDING_FAULTS if loaded else _WAY_FAULTS)
+    explained = stands or (direction.status == PROBLEM and fault in (_STANDING_FAULTS if loaded else _WAY_FAULTS))
     if fault is Fault.POSITION_DISAGREEMENT:
         explained = explained or any(finding.status == PROBLEM for finding in encoders)
-    if fault is not Fault.NONE and not explained and not stands:
+    if fault is not Fault.NONE and not explained:
         yield ended_finding(records, fault, text)
 
 
