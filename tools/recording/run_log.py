@@ -148,8 +148,9 @@ class McapFile:
         number = len(self._channels) + 1
         self._schemas.append(Schema(id=number, data=definition.encode(), encoding="ros2msg", name=schema))
         self._channels.append(Channel(id=number, topic=topic, message_encoding="cdr", schema_id=number, metadata={}))
-        self._schemas[-1].write(self._chunk)
-        self._channels[-1].write(self._chunk)
+        for record in (self._schemas[-1], self._channels[-1]):
+            record.write(self._chunk)
+            self._end_full_chunk()
         return number
 
     def add_messages(self, channel: int, times_ns: np.ndarray, rows: np.ndarray) -> None:
@@ -167,13 +168,16 @@ class McapFile:
             self._entries.setdefault(channel, []).append(entries)
             self._chunk.write(part.tobytes())
             at += len(part)
-            if self._chunk.count > CHUNK_BYTES:
-                self._end_chunk()
+            self._end_full_chunk()
 
     def add_message(self, channel: int, time_ns: int, body: bytes) -> None:
         row = np.zeros(1, message_rows(("body", f"V{len(body)}")))
         row["body"] = np.void(body)
         self.add_messages(channel, np.array([time_ns]), row)
+
+    def _end_full_chunk(self) -> None:
+        if self._chunk.count > CHUNK_BYTES:
+            self._end_chunk()
 
     def _end_chunk(self) -> None:
         if not self._entries:

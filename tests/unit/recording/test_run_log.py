@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -157,6 +157,9 @@ class BothFiles:
             return make_reader(file).get_summary()
 
 
+@example(steps=[
+    (0, 0, b"\0"), "flush", "channel", "channel", "channel", (0, 0, b"\0"), (0, 254, 1000), "channel",
+])  # whose schema ends the chunk  # fmt: skip
 @given(steps=STEPS)
 def test_a_file_is_the_library_s_byte_for_byte(tmp_path_factory: pytest.TempPathFactory, steps: list[Any]) -> None:
     both = BothFiles(tmp_path_factory.mktemp("both"))
