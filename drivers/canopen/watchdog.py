@@ -13,6 +13,7 @@ a second as long as the loop runs, which costs four SDO uploads.
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable
 
 import canopen
@@ -172,9 +173,18 @@ def prove_watchdog(
     network.subscribe(EMERGENCY_ID + node, witness.on_emergency)
     network.subscribe(HEARTBEAT_ID + node, witness.on_heartbeat)
     try:
+        apart_s = 0.0
         for _ in range(BEATS):
             network.send_message(HEARTBEAT_ID + master_node, bytes([NmtState.OPERATIONAL]))
+            sent_s = time.monotonic()
             sleep(heartbeat_s / BEATS_PER_TIMEOUT)
+            apart_s = max(apart_s, time.monotonic() - sent_s)
+        if witness.seen and apart_s >= heartbeat_s:
+            raise DeviceError(
+                f"node {node}: the watchdog tripped ({witness.seen}), and rightly: this computer stood still, and its "
+                f"heartbeats came {apart_s:.2f} s apart (allowed {heartbeat_s:g} s, drive.heartbeat_s)",
+                "nothing has moved: try again with fewer programs beside it; `jointctl doctor` measures late wake-ups",
+            )
         if witness.seen:
             raise DeviceError(
                 f"node {node}: the watchdog tripped ({witness.seen}) although the heartbeat of node {master_node} came",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import struct
+import time
 from typing import Any
 
 import pytest
@@ -273,6 +274,18 @@ def test_a_watchdog_that_trips_while_the_heartbeat_comes_is_refused(timeout_s: f
             prove(network)
     else:
         assert prove(network) == "EMCY 8130h"
+
+
+def test_a_computer_that_stands_still_does_not_lay_it_to_another_program() -> None:
+    network = StubNetwork(EMERGENCY)
+
+    def sleep(seconds: float) -> None:
+        lost_s = TIMEOUT_s if network.beats == 2 else 0.0
+        time.sleep(lost_s)
+        network.sleep(seconds + lost_s)
+
+    with pytest.raises(DeviceError, match=r"and rightly: this computer stood still, .* came 0\.\d\d s apart"):
+        prove_watchdog(network, NODE, MASTER, TIMEOUT_s, sleep)  # type: ignore[arg-type]
 
 
 class Telling(StubNetwork):
