@@ -11,6 +11,7 @@ import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MotionFault, UsageError
 from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
@@ -18,7 +19,7 @@ from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.tune import TuneOptions, tune
-from jointctl.tools.verbs.tune_steps import Tune
+from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written
 
@@ -75,6 +76,17 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
     folder = wrong.with_suffix(".tune")
     assert "Bode plot" in (folder / "report.html").read_text()
     assert (folder / "before.toml").read_text() == text
+
+
+def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:
+    path = written(tmp_path / "soft.toml", "realistic")
+    output, out, _ = outputs()
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True)) == 0
+    assert json.loads(out.getvalue())["friction"]["points"] > 30
+    tuned = load_config(path)
+    assert tuned.control.kind == "flexible_joint"
+    assert tuned.control.observer_radps > SWEEP_OBSERVER_radps  # not a slower one, which measures the friction
+    require_margin(tuned)
 
 
 def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:

@@ -20,7 +20,8 @@ from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
-from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margin_gate import meets, require_margin
+from jointctl.tools.analysis.margins import margins
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
@@ -78,7 +79,7 @@ FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
-SWEEP_OBSERVER_radps = 50.0
+SWEEP_OBSERVER_radps, OBSERVERS = 50.0, 8  # at most, where the gate allows it; how many are tried from there
 SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_FROM_s = 5.0
 REFINE_RUNS = 4
@@ -264,10 +265,7 @@ class Tune:
 
         And a quick observer hunts there.
         """
-        config, kept = self._before_friction(), self.state["response"]["gravity"]
-        observer_radps = min(config.control.observer_radps, SWEEP_OBSERVER_radps)
-        control = config.control.model_copy(update={"observer_radps": observer_radps})
-        config = config.model_copy(update={"control": control})
+        config, kept = _with_slow_observer(self._before_friction()), self.state["response"]["gravity"]
         static_Nm = static_friction_Nm(config)
         if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
             return config
@@ -566,6 +564,17 @@ class Tune:
         self._save()
         write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
+
+
+def _with_slow_observer(config: Config) -> Config:
+    """As slow as the gate allows: with both encoders of a soft joint the observer damps the link, too."""
+    chosen_radps = config.control.observer_radps
+    for observer_radps in np.geomspace(min(chosen_radps, SWEEP_OBSERVER_radps), chosen_radps, OBSERVERS):
+        control = config.control.model_copy(update={"observer_radps": float(f"{observer_radps:.3g}")})
+        slower = config.model_copy(update={"control": control})
+        if meets(margins(loop_settings(slower)[0]), config.margin.min_phase_margin_deg):
+            return slower
+    return config
 
 
 def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
