@@ -89,6 +89,15 @@ def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(
     require_margin(tuned)
 
 
+def test_a_tune_chooses_the_law_of_the_paper_where_it_is_wanted(wrong: Path) -> None:
+    output, out, _ = outputs()
+    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, law="paper")) == 0
+    tuned = load_config(wrong)
+    assert (tuned.control.kind, tuned.control.observer_radps) == ("computed_torque_rbf", 0.0)
+    found = json.loads(out.getvalue())["verification"]
+    assert found["after"]["rmse_mrad"] < found["before"]["rmse_mrad"]
+
+
 def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:
     output, *_ = outputs()
     assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, objective="quiet")) == 0

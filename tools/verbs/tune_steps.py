@@ -569,7 +569,7 @@ class Tune:
 def _with_slow_observer(config: Config) -> Config:
     """As slow as the gate allows: with both encoders of a soft joint the observer damps the link, too."""
     chosen_radps = config.control.observer_radps
-    for observer_radps in np.geomspace(min(chosen_radps, SWEEP_OBSERVER_radps), chosen_radps, OBSERVERS):
+    for observer_radps in np.linspace(min(chosen_radps, SWEEP_OBSERVER_radps), chosen_radps, OBSERVERS):
         control = config.control.model_copy(update={"observer_radps": float(f"{observer_radps:.3g}")})
         slower = config.model_copy(update={"control": control})
         if meets(margins(loop_settings(slower)[0]), config.margin.min_phase_margin_deg):
