@@ -44,7 +44,8 @@ from jointctl.tools.analysis.linear_loop import (
     sampled_joint,
     two_masses,
 )
-from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
+from jointctl.tools.analysis.margin_gate import meets
+from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
@@ -73,6 +74,7 @@ QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for another
 UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
+SLOW_OBSERVERS = 8  # that are tried, from the slowest on
 LEARNING_FACTOR = 0.9  # of a repetition, wanted
 SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
@@ -270,6 +272,11 @@ def _payload_given(config: Config) -> bool:
     return "payload_range" in config.margin.model_fields_set
 
 
+def _late_s(settings: LoopSettings, fit: JointFit) -> float:
+    """The loop delay at the late end of what was identified."""
+    return settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
+
+
 class _Search:
     def __init__(self, config: Config, law: Law, fit: JointFit, settings: LoopSettings) -> None:
         self.law, self.nominal = law, settings
@@ -278,7 +285,7 @@ class _Search:
         self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
-        late_s = settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
+        late_s = _late_s(settings, fit)
         joints = [
             sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders)
             for joint in identified_joints(config, fit)
@@ -463,6 +470,26 @@ def converging(settings: LoopSettings, learning: Learning | None) -> Learning | 
             update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
         )
     return slow
+
+
+def with_slow_observer(config: Config, fit: JointFit, most_radps: float) -> Config:
+    """With an observer of at most that bandwidth, or as slow as the gate allows at the late end of delay and lag.
+
+    With both encoders of a soft joint the observer damps the link, too: it cannot be as slow as one likes.
+    """
+    chosen_radps = config.control.observer_radps
+    if chosen_radps <= most_radps:
+        return config
+    settings, _ = loop_settings(config)
+    settings = replace(settings, delay_s=_late_s(settings, fit))
+    for radps in np.linspace(most_radps, chosen_radps, SLOW_OBSERVERS):
+        observer_radps = float(f"{radps:.3g}")
+        slower = replace(settings, observer_radps=observer_radps)
+        if meets(margins(slower), config.margin.min_phase_margin_deg):
+            return config.model_copy(
+                update={"control": config.control.model_copy(update={"observer_radps": observer_radps})}
+            )
+    return config
 
 
 # --- the picture ---

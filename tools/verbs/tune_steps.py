@@ -20,8 +20,7 @@ from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
-from jointctl.tools.analysis.margin_gate import meets, require_margin
-from jointctl.tools.analysis.margins import margins
+from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
@@ -61,7 +60,13 @@ from jointctl.tools.tuning.carry_out import (
     with_motion,
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
-from jointctl.tools.tuning.gains import TWO_ENCODERS, ChosenGains, choose_gains, has_both_encoders
+from jointctl.tools.tuning.gains import (
+    TWO_ENCODERS,
+    ChosenGains,
+    choose_gains,
+    has_both_encoders,
+    with_slow_observer,
+)
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of, values_of_fit
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
 from jointctl.tools.verbs.response import AS_IT_FITS
@@ -79,7 +84,7 @@ FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
-SWEEP_OBSERVER_radps, OBSERVERS = 50.0, 8  # at most, where the gate allows it; how many are tried from there
+SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
 SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_FROM_s = 5.0
 REFINE_RUNS = 4
@@ -265,9 +270,12 @@ class Tune:
 
         And a quick observer hunts there.
         """
-        config, kept = _with_slow_observer(self._before_friction()), self.state["response"]["gravity"]
-        static_Nm = static_friction_Nm(config)
-        if self.fit is None or static_Nm is None or "sliding_Nm" not in kept:
+        config = self._before_friction()
+        if self.fit is None:
+            return config
+        config = with_slow_observer(config, self.fit, SWEEP_OBSERVER_radps)
+        static_Nm, kept = static_friction_Nm(config), self.state["response"]["gravity"]
+        if static_Nm is None or "sliding_Nm" not in kept:
             return config
         positive_Nm, negative_Nm = kept["sliding_Nm"]
         return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value, SPEED_radps)
@@ -564,17 +572,6 @@ class Tune:
         self._save()
         write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
-
-
-def _with_slow_observer(config: Config) -> Config:
-    """As slow as the gate allows: with both encoders of a soft joint the observer damps the link, too."""
-    chosen_radps = config.control.observer_radps
-    for observer_radps in np.linspace(min(chosen_radps, SWEEP_OBSERVER_radps), chosen_radps, OBSERVERS):
-        control = config.control.model_copy(update={"observer_radps": float(f"{observer_radps:.3g}")})
-        slower = config.model_copy(update={"control": control})
-        if meets(margins(loop_settings(slower)[0]), config.margin.min_phase_margin_deg):
-            return slower
-    return config
 
 
 def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:

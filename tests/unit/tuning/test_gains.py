@@ -15,11 +15,13 @@ from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
 from jointctl.tools.tuning.gains import (
     SENSITIVITY,
+    LEAST_LATE_s,
     PHASE_MARGIN_deg,
     choose_gains,
     converging,
     lossless_joints,
     steady_joints,
+    with_slow_observer,
 )
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
 from jointctl.tools.virtual_joint import plant_settings
@@ -86,6 +88,19 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     assert found.best.settings.observer_radps < 120.0
     assert found.best.noise_Nm < 0.61  # 1.8 Nm were 3 % of this joint's torque
     assert found.control.adaptation is not None
+
+
+def test_the_slower_observer_of_a_soft_joint_passes_the_gate_where_it_is_later_than_was_found() -> None:
+    fit = fit_of(2.1, 1.8e-3, 1.1, 2.6e4)
+    config = known(shipped("realistic"), fit)
+    config = changed(config, control=choose_gains(config, fit).control)
+    slower = with_slow_observer(config, fit, 20.0)
+    assert 20.0 < slower.control.observer_radps < config.control.observer_radps
+    settings, _ = loop_settings(slower)
+    later = margins(replace(settings, delay_s=settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)))
+    assert later.phase_margin_deg >= config.margin.min_phase_margin_deg
+    assert slower.control.kv == config.control.kv
+    assert with_slow_observer(config, fit, config.control.observer_radps) is config
 
 
 SLUGGISH = {"kp": 141.0, "kv": 9.68, "observer_radps": 27.4, "cutoff_Hz": 5.46, "link_cutoff_Hz": 60.0}
