@@ -70,12 +70,6 @@ def on_core(core: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def keep_on_core(pid: int, core: int) -> None:
-    """Every thread that a process has."""
-    for thread in os.listdir(f"/proc/{pid}/task"):
-        os.sched_setaffinity(int(thread), {core})
-
-
 @contextmanager
 def python_thread() -> Iterator[None]:
     """A thread that computes in Python and so wants the interpreter's lock all the time."""
@@ -482,8 +476,9 @@ def arm_exchange_rows(folder: Path, *, rounds: int, seconds: float) -> Iterator[
     long.mkdir()
     for path in (SHIPPED_ARM, long_arm(long)):
         channel = f"bench-{path.parent.name}{os.getpid()}"
-        with separate_virtual_joint(path, channel, timing=True) as arm:
-            keep_on_core(arm.pid, cores()[-1])
+        with ExitStack() as stack:
+            with on_core(cores()[-1]):
+                stack.enter_context(separate_virtual_joint(path, channel, timing=True))
             yield from _against_c(Case(arm_for_comparison(path, channel), "idle", seconds), program, rounds)
 
 
