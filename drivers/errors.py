@@ -131,10 +131,18 @@ class MotionFault(JointctlError):
     exit_code = 7
 
 
+class LimitCycle(MotionFault):
+    """The motion was stopped because torque or error swung back and forth instead of settling."""
+
+
 class DataError(JointctlError):
     """A data file cannot be read, or its content does not allow the asked computation."""
 
     exit_code = 8
+
+
+class TooFewPoints(DataError):
+    """Too few plateaus with a steady speed are left for an identification."""
 
 
 class MarginError(JointctlError):

@@ -67,6 +67,7 @@ from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
 RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
 IN_LOCKSTEP = sweeping.sweep_in_lockstep
+LAWS: dict[str, Any] = {"both": "joint_encoder", "motor": "encoder", "link": "joint_encoder_alone"}  # of `study`
 HELD_LINK = ((0.0, 1e4), (0.0, 200.0))  # of a rigid joint: a link that nothing moves
 
 
@@ -242,11 +243,13 @@ def rmse_mrad(config: Config) -> tuple[float, float]:
     return early, late
 
 
-def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
+def tuned(task: tuple[int, int, bool, str, bool]) -> dict[str, Any]:
     """One joint; with `failed` where it was not tuned."""
-    seed, index, soft, motions = task
+    seed, index, soft, encoders, motions = task
     base = load_config(shipped_config("realistic" if soft else "precise"))
-    plant = random_plant(base, EnsembleSettings(flexible=soft), seed, index)
+    plant = random_plant(base, EnsembleSettings(flexible=soft, law=LAWS[encoders]), seed, index)
+    if encoders == "motor":
+        plant = plant.model_copy(update={"joint_encoder": None})
     assert plant.virtual is not None
     true_kgm2 = plant.joint.inertia_kgm2 * plant.virtual.inertia_scale
     guess = wrong_guess(plant, seed, index)
@@ -271,8 +274,15 @@ def tuned(task: tuple[int, int, bool, bool]) -> dict[str, Any]:
     row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
     row["late_ms_half"] = 1e3 * fit.late_s.half
     row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
-    local = local_reducer(plant, true_kgm2, carrier) if soft else (0.0, 0.0, 0.0)
-    if soft:
+    local = (0.0, 0.0, 0.0)
+    if encoders == "link":  # which tells neither the twist nor the two inertias apart
+        stiffness, damping = SMALL_MOTION * virtual.reducer_stiffness_Nmprad, fit.damping_Nmspr.value
+        motor_kgm2 = virtual.motor_side_inertia_kgm2
+        joint = TwoMasses(motor_kgm2, true_kgm2 - motor_kgm2, stiffness, damping)
+        local = (stiffness, joint.resonance_Hz, damping)
+    elif soft:
+        local = local_reducer(plant, true_kgm2, carrier)
+    if soft and encoders != "link":
         link = true_kgm2 - virtual.motor_side_inertia_kgm2
         row["link"] = fit.link_kgm2.value / link - 1.0
         row["stiffness_over_first"] = fit.stiffness_Nmprad.value / virtual.reducer_stiffness_Nmprad
@@ -317,12 +327,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=90701)
     parser.add_argument("--plants", type=int, default=40)
     parser.add_argument("--soft", action="store_true")
+    parser.add_argument("--encoders", choices=tuple(LAWS), default="both", help="of a soft joint; default: both")
     parser.add_argument("--motions", action="store_true")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler: docs/cluster.md")
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
-    tasks = [(given.seed, index, given.soft, given.motions) for index in range(given.plants)]
+    tasks = [(given.seed, index, given.soft, given.encoders, given.motions) for index in range(given.plants)]
     rows: list[dict[str, Any]] = []
     for row in Workers(given.workers, given.cluster).results(tuned, tasks):
         rows.append(row)

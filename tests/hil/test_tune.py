@@ -5,19 +5,29 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import (
+    ConfigurationError,
+    DataError,
+    JointctlError,
+    LimitCycle,
+    MotionFault,
+    TooFewPoints,
+    UsageError,
+)
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.verbs.response import ResponseOptions, response
+from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
@@ -44,6 +54,15 @@ def test_the_response_of_a_soft_joint_names_both_masses(tmp_path: Path, monkeypa
     assert 1.4 < values["stiffness_Nmprad"] / 1.6e4 < 2.0  # hysteresis makes a small motion stiffer
     assert (tmp_path / "realistic.response.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "realistic.response.json").read_text()) == found
+
+
+def friction_step(folder: Path, *, resume: bool = False) -> Tune:
+    """A tune that comes to the step of the friction."""
+    config = load_config(written(folder / "joint.toml", "precise"))
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    job = Tune(config, TuneOptions(lockstep=True, resume=resume), carrier, folder)
+    job.state = {"direction": [{"numbers": {"break_away_Nm": 19.0}}], "response": {"gravity": {}}}
+    return job
 
 
 @pytest.fixture
@@ -87,6 +106,48 @@ def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(
     assert tuned.control.kind == "flexible_joint"
     assert tuned.control.observer_radps > SWEEP_OBSERVER_radps  # not a slower one, which measures the friction
     require_margin(tuned)
+
+
+def test_a_tune_of_a_soft_joint_with_its_encoder_on_the_link_alone_passes_the_gate(tmp_path: Path) -> None:
+    control = load_config(shipped_config("precise")).control.model_dump(mode="json", exclude_none=True)
+    path = written(
+        tmp_path / "link.toml", "realistic", encoder__side="joint", encoder__counts_per_turn=524288, joint_encoder=None,
+        reducer=None, control=control,
+    )  # fmt: skip
+    output, out, _ = outputs()
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True)) == 0
+    found, tuned = json.loads(out.getvalue()), load_config(path)
+    assert found["gains"]["law"] == "link_encoder"
+    assert not found["response"]["fit"]["tells_link"]
+    assert tuned.joint.inertia_kgm2 == pytest.approx(2.1, rel=0.03)
+    assert found["verification"]["after"]["rmse_mrad"] < 1.5
+    assert "before_refused" in found["verification"]
+    assert "a share that the encoder on the link does not tell" in path.read_text()
+    require_margin(tuned)
+
+
+@pytest.mark.parametrize(("ends", "slowest"), [([LimitCycle("")], 25.0), ([TooFewPoints(""), LimitCycle("")], 8.0)])
+def test_slow_plateaus_that_swing_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: list[JointctlError], slowest: float
+) -> None:
+    job = friction_step(tmp_path)
+    measure, todo = Tune._sweep, list(ends)
+
+    def swings(self: Tune, command: Sweep) -> None:
+        if todo:
+            raise todo.pop(0)
+        measure(self, command)
+
+    monkeypatch.setattr(Tune, "_sweep", swings)
+    assert job._step_friction()["points"] > 30
+    speeds = np.abs(read_friction_data(tmp_path / "friction.csv", None).velocity_radps)
+    assert np.max(speeds) / np.min(speeds) == pytest.approx(slowest, rel=0.03)
+    before = (tmp_path / "friction.csv").read_bytes()
+    assert friction_step(tmp_path, resume=True)._step_friction()["points"] > 30  # with what there is
+    assert (tmp_path / "friction.csv").read_bytes() == before
+    todo += [LimitCycle("swings")] * 3
+    with pytest.raises(LimitCycle, match="swings"):
+        friction_step(tmp_path)._step_friction()
 
 
 def test_a_tune_chooses_the_law_of_the_paper_where_it_is_wanted(wrong: Path) -> None:
@@ -180,15 +241,7 @@ def test_it_is_verified_from_wherever_the_joint_stands(
 
 @pytest.mark.parametrize("plan", ["same", "another"])
 def test_a_friction_step_that_was_cut_off_goes_on_where_it_ended(tmp_path: Path, plan: str) -> None:
-    config = load_config(written(tmp_path / "joint.toml", "precise"))
-    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
-
-    def step(*, resume: bool) -> dict[str, Any]:
-        job = Tune(config, TuneOptions(lockstep=True, resume=resume), carrier, tmp_path)
-        job.state = {"direction": [{"numbers": {"break_away_Nm": 19.0}}], "response": {"gravity": {}}}
-        return job._step_friction()
-
-    step(resume=False)
+    friction_step(tmp_path)._step_friction()
     path, beside = tmp_path / "friction.csv", tmp_path / "friction.json"
     kept, sidecar = path.read_bytes().splitlines(keepends=True)[:11], json.loads(beside.read_text())
     every = set(sidecar["measured"])
@@ -196,7 +249,7 @@ def test_a_friction_step_that_was_cut_off_goes_on_where_it_ended(tmp_path: Path,
     path.write_bytes(b"".join(kept))
     sidecar |= {"measured": sidecar["measured"][:10], "unsettled": {}} | ({"plan": "0"} if plan == "another" else {})
     beside.write_text(json.dumps(sidecar))
-    assert step(resume=True)["points"] > 30
+    assert friction_step(tmp_path, resume=True)._step_friction()["points"] > 30
     assert set(json.loads(beside.read_text())["measured"]) == every
     assert (path.read_bytes().splitlines(keepends=True)[:11] == kept) is (plan == "same")
 

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError, UsageError
+from jointctl.drivers.errors import DataError, TooFewPoints, UsageError
 from jointctl.firmware_py.input_file import number_from, parse_json
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
 from jointctl.tools.identification.tables import TableFile, read_bytes, read_table
@@ -136,7 +136,7 @@ def check_directions(data: FrictionData, both: bool) -> None:
     if both and min(counts.values()) == 0:
         raise DataError(f"{data.path}: {text}: both directions are needed, each is identified by itself")
     if both and min(counts.values()) < MIN_PER_DIRECTION:
-        raise DataError(f"{data.path}: {text}: at least {MIN_PER_DIRECTION} are needed in each direction")
+        raise TooFewPoints(f"{data.path}: {text}: at least {MIN_PER_DIRECTION} are needed in each direction")
     if max(counts.values()) == 0:
         raise DataError(f"{data.path}: {text}")
 

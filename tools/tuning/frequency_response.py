@@ -60,8 +60,9 @@ TORQUE_SHARE = 0.15  # of limits.torque_max_Nm: peak of the multisine, unless th
 LEAST_SHARE = 1.0 / 8.0  # of that peak: where it begins
 FRICTION_SPARE = 1.2  # of the static friction, which the excitation leaves room for
 
-# the weak law
+# the weak law; its velocity filter, at most, with an encoder behind the reducer, whose resonance a higher one excites
 KP_ps2, KV_ps, OBSERVER_radps = 100.0, 20.0, 15.0
+LINK_CUTOFF_Hz = 15.0
 
 
 @dataclass(frozen=True)
@@ -220,6 +221,8 @@ def config_of_response(config: Config, torque_Nm: float | None, *, own_law: bool
             "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
             "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
         }  # fmt: skip
+        if config.encoder.side == "joint":
+            law["velocity_cutoff_Hz"] = min(config.control.velocity_cutoff_Hz or LINK_CUTOFF_Hz, LINK_CUTOFF_Hz)
     config = with_mode(config, "torque")
     update: dict[str, Any] = {"control": config.control.model_copy(update=law)}
     if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:

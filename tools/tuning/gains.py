@@ -65,9 +65,13 @@ LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow it
 LEAST_STIFFNESS_SHARE = 0.1
 LEAST_LATE_s = 0.1e-3
 GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
-TWO_ENCODERS = "[joint_encoder] beside an encoder on the motor"
+NEEDED = {
+    Encoders.BOTH: "[joint_encoder] beside an encoder on the motor",
+    Encoders.LINK: 'encoder.side = "joint" and no [joint_encoder]',
+}
 SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
 LEAST_DAMPING = 0.02  # of the critical one: of a strain wave gear without its hysteresis, 0.02 to 0.06
+EASED = 2.0  # share of margins that the encoder on the link alone need not keep there: it would be left with few gains
 LINK_CUTOFF = 2.0  # times the velocity filter: that of the link's velocity, at most
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
@@ -92,6 +96,7 @@ class Law:
     spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
     kp_of_kv: float
 
+    encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
@@ -133,31 +138,47 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, None, QUICKEST_OBSERVER_radps,
+        USUAL_OBSERVER_radps,
     ),
     "paper": Law(
         "paper", paper_control, ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
     "two_encoders": Law(
         "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, Encoders.BOTH, LARGEST_OBSERVER_radps,
+        most_noise_Nm=LARGEST_NOISE_Nm,
+    ),
+    "link_encoder": Law(
+        "link_encoder", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
+        ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, Encoders.LINK, LARGEST_OBSERVER_radps,
         most_noise_Nm=LARGEST_NOISE_Nm,
     ),
 }  # fmt: skip
 
 
-def has_both_encoders(config: Config) -> bool:
-    """One on the motor, which [encoder] describes, and one behind the reducer."""
-    return config.joint_encoder is not None and config.encoder.side == "motor"
+def require_encoders(config: Config, wanted: str) -> None:
+    """`ConfigurationError` where the law that is `wanted` is for other encoders than there are."""
+    law = LAWS.get(wanted)
+    if law is not None and law.encoders not in (None, _encoders_of(config)):
+        raise ConfigurationError(f"{config.path}: --law (={wanted}) needs {NEEDED[law.encoders]}")
+
+
+def _encoders_of(config: Config) -> Encoders:
+    if config.encoder.side == "joint":
+        return Encoders.LINK
+    return Encoders.MOTOR if config.joint_encoder is None else Encoders.BOTH
 
 
 def chosen_law(config: Config, fit: JointFit, wanted: str) -> Law:
-    """`wanted` "auto": both encoders where the reducer is soft and there are two, else the precise one."""
-    both = has_both_encoders(config)
+    """`wanted` "auto": that of the encoders where the reducer is soft and one of them sees the link, else precise."""
     if wanted == "auto":
-        wanted = "two_encoders" if fit.flexible and both else "precise"
-    if wanted == "two_encoders" and not (fit.flexible and both):
-        raise ConfigurationError(f"--law (=two_encoders) needs {TWO_ENCODERS}, and a reducer that is seen to be soft")
+        there = _encoders_of(config) if fit.flexible else None
+        fitting = (name for name, law in LAWS.items() if there is not None and law.encoders == there)
+        return LAWS[next(fitting, "precise")]
+    require_encoders(config, wanted)
+    if LAWS[wanted].encoders is not None and not fit.flexible:
+        raise ConfigurationError(f"--law (={wanted}) needs a reducer that is seen to be soft")
     return LAWS[wanted]
 
 
@@ -237,16 +258,30 @@ def identified_joints(config: Config, fit: JointFit) -> list[float | TwoMasses]:
         factors = [p * end for p in payload for end in ends] if _payload_given(config) else list(ends)
         return [config.joint.inertia_kgm2 * factor for factor in (1.0, *factors)]
     stiffness = max(fit.stiffness_Nmprad.half / fit.stiffness_Nmprad.value, LEAST_STIFFNESS_SHARE)
-    link = max(fit.link_kgm2.half / fit.link_kgm2.value, LEAST_INERTIA_SHARE)
     believed = two_masses(config, config.reducer, 1.0, 1.0, False)
     found = [believed, *(replace(believed, motor_kgm2=end * believed.motor_kgm2) for end in ends[1:])]
+    sides = (-1.0, 1.0)
+    if fit.tells_link:
+        link = max(fit.link_kgm2.half / fit.link_kgm2.value, LEAST_INERTIA_SHARE)
+        shares = [replace(believed, link_kgm2=(1.0 + side * link) * believed.link_kgm2) for side in sides]
+    else:
+        stiffness = max(2.0 * fit.resonance_Hz.half / fit.resonance_Hz.value, LEAST_STIFFNESS_SHARE)
+        half = min(fit.link_kgm2.half, 0.9 * min(believed.link_kgm2, believed.motor_kgm2))
+        shares = [_with_link(believed, believed.link_kgm2 + side * half) for side in sides]
     found += [
-        two_masses(config, config.reducer, p * factor, k, False)
+        replace(one, link_kgm2=p * one.link_kgm2, stiffness_Nmprad=(1.0 + side * stiffness) * one.stiffness_Nmprad)
         for p in payload
-        for factor in (1.0 - link, 1.0 + link)
-        for k in (1.0 - stiffness, 1.0 + stiffness)
+        for one in shares
+        for side in sides
     ]
     return list(found)
+
+
+def _with_link(joint: TwoMasses, link_kgm2: float) -> TwoMasses:
+    """With another share of the link, the same resonance and damping of it."""
+    motor_kgm2 = joint.motor_kgm2 + joint.link_kgm2 - link_kgm2
+    factor = motor_kgm2 * link_kgm2 / (joint.motor_kgm2 * joint.link_kgm2)
+    return TwoMasses(motor_kgm2, link_kgm2, factor * joint.stiffness_Nmprad, factor * joint.damping_Nmspr)
 
 
 def steady_joints(config: Config) -> list[TwoMasses]:
@@ -292,11 +327,13 @@ class _Search:
         ]
         self._of_goals = len(joints)
         joints += [linear_loop(case).joint for case in cases(settings)]
-        # a law that damps the link by its own encoder would be left with hardly any gains
-        large = steady_joints(config) + (lossless_joints(config) if settings.encoders != Encoders.LINK else [])
+        large = steady_joints(config) + lossless_joints(config)
         joints += [
             sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders) for joint in large
         ]
+        self._eased = np.ones(len(joints))
+        if settings.encoders == Encoders.LINK:
+            self._eased[len(joints) - len(lossless_joints(config)) :] = EASED
         self._responses = np.array([joint.response(self._z) for joint in joints])
         plants = [joint.state_space() for joint in joints]
         sizes = [len(plant.a) for plant in plants]  # by their delay
@@ -325,6 +362,7 @@ class _Search:
             return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
         law = controller.response(self._z)
         phases, gains, peaks = _margins(-(law @ self._responses)[:, :, 0, 0])
+        phases, peaks = phases * self._eased, peaks / self._eased
         own = slice(self._of_goals)
         gate = slice(self._of_goals, None)
         response = self._responses[0]
@@ -450,6 +488,12 @@ def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
     if "q" in law.keys:
         named["lyapunov_q"] = settings.q
     return named
+
+
+def apart(one: LoopSettings, other: LoopSettings) -> float:
+    """Greatest difference of the gains, of their logarithms."""
+    pairs = [(getattr(one, key), getattr(other, key)) for key in ("kv", "observer_radps", "cutoff_Hz")]
+    return max((abs(math.log(a / b)) for a, b in pairs if a > 0.0 and b > 0.0), default=0.0)
 
 
 def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:

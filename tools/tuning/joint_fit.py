@@ -42,11 +42,13 @@ STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
 USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
+RATIO_SPREAD = 0.7  # of the logarithm of link over motor: the link's encoder alone sees their sum and the resonance
 LATEST_s = 0.012  # of delay and of lag, at most
 # by which a value is off besides, because sliding friction is not viscous, and hysteresis no spring: of
 # tests/bench/tune_ensemble.py
 MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.09, "resonance_Hz": 0.05}
 MODEL_LATE_s = 1e-4
+UNSEEN_LATE_s = 6e-4  # the same where the link's encoder is alone: there is no antiresonance to tell a loss from delay
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
            "delay_s", "lag_s", "late_s", "loss_factor")  # fmt: skip
@@ -74,6 +76,7 @@ class JointFit:
     rms: float  # of the relative error over the lines that were used
     lines: int
     criterion: float  # by which the chosen model is better than the other one
+    tells_link: bool = True  # False: its share of the inertia is believed, an encoder on the link alone does not see it
 
     def __getattr__(self, name: str) -> Estimate:
         try:
@@ -106,6 +109,7 @@ class JointFit:
             "model": "two masses" if self.flexible else "rigid",
             "values": {name: {"value": one.value, "half": one.half} for name, one in self.values.items()},
             "period_s": self.period_s, "rms": self.rms, "lines": self.lines, "criterion": self.criterion,
+            "tells_link": self.tells_link,
         }  # fmt: skip
 
 
@@ -114,8 +118,9 @@ def fit_from_dict(found: dict[str, Any]) -> JointFit:
     values = {name: Estimate(one["value"], one["half"]) for name, one in found["values"].items()}
     values.setdefault("loss_factor", Estimate(0.0, 0.0))  # of a tune that was begun before there was one
     return JointFit(
-        found["model"] == "two masses", values, found["period_s"], found["rms"], found["lines"], found["criterion"]
-    )
+        found["model"] == "two masses", values, found["period_s"], found["rms"], found["lines"], found["criterion"],
+        found.get("tells_link", True),
+    )  # fmt: skip
 
 
 def _response(
@@ -174,9 +179,11 @@ class _Model:
     The loss is that of hysteresis: as damping alone it would look like delay.
     """
 
-    def __init__(self, parts: list[_Data], period_s: float, flexible: bool) -> None:
+    def __init__(self, parts: list[_Data], period_s: float, flexible: bool, link_over_motor: float) -> None:
         self.parts, self.period_s, self.flexible = parts, period_s, flexible
         self.count = 2 * sum(len(part.sigma) for part in parts)
+        self.ratio = math.log(link_over_motor)
+        self.tells_link = not flexible or any(part.side == "motor" for part in parts)
 
     def joint(self, x: np.ndarray) -> TwoMasses:
         inertia, viscous = math.exp(x[0]), x[3]
@@ -192,9 +199,16 @@ class _Model:
     def loss(self, x: np.ndarray) -> float:
         return float(x[7]) if self.flexible else 0.0
 
+    def believed(self, x: np.ndarray) -> NDArray[np.float64]:
+        """Residuals of what is known beforehand of values that the data hardly tell."""
+        rows = [(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD]
+        if not self.tells_link:
+            rows.append((x[4] - self.ratio) / RATIO_SPREAD)
+        return np.array(rows)
+
     def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
         joint, late = self.joint(x), (math.exp(x[1]), math.exp(x[2]))
-        rows = [np.array([(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD])]
+        rows = [self.believed(x)]
         for part in self.parts:
             side = part.side if self.flexible else "motor"
             model = _response(joint, self.loss(x), *late, self.period_s, part.frequency_Hz)[side]
@@ -229,13 +243,25 @@ class _Model:
         return np.array([*parts, x[3], delay, lag, delay + lag, self.loss(x)])
 
 
-def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
-    """The model that the data choose; `inertia_kgm2` is where the search begins.  `DataError` with too few lines."""
+def configured_ratio(config: Config) -> float:
+    """Inertia of the link over that of the motor, as the file has them; 1 where it has no reducer."""
+    if config.reducer is None:
+        return 1.0
+    motor = config.reducer.motor_inertia_kgm2
+    return (config.joint.inertia_kgm2 - motor) / motor
+
+
+def fit_joint(found: FrequencyResponse, inertia_kgm2: float, link_over_motor: float = 1.0) -> JointFit:
+    """The model that the data choose; `inertia_kgm2` is where the search begins.  `DataError` with too few lines.
+
+    The inertia of link over motor is believed to be about `link_over_motor` where only the link was measured, whose
+    response does not tell it.
+    """
     parts = _used(found)
     begin = [math.log(inertia_kgm2), math.log(0.0015), math.log(0.0005), 5.0]
-    rigid = _Model(parts, found.period_s, False)
+    rigid = _Model(parts, found.period_s, False, link_over_motor)
     one = min((rigid.fitted([begin[0] + step, *begin[1:]]) for step in (-0.5, 0.5)), key=lambda fit: fit.cost)
-    soft = _Model(parts, found.period_s, True)
+    soft = _Model(parts, found.period_s, True, link_over_motor)
     inertia = float(np.clip(one.x[0], -3.0 + begin[0], 3.0 + begin[0]))
     starts = [
         [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE), LOSS]
@@ -249,17 +275,18 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
     flexible = better > BETTER and soft.joint(two.x).resonance_Hz < highest
     model, best = (soft, two) if flexible else (rigid, one)
     relative = [part.sigma for part in parts]
-    weighted = model.residuals(best.x)[1:] * np.concatenate([np.concatenate((s, s)) for s in relative])
+    measured = model.residuals(best.x)[len(model.believed(best.x)) :]
+    weighted = measured * np.concatenate([np.concatenate((s, s)) for s in relative])
     return JointFit(
         flexible, _intervals(model, best), found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
-        abs(better),
+        abs(better), model.tells_link,
     )  # fmt: skip
 
 
 def fitted_again(found: FrequencyResponse, before: JointFit) -> Estimate:
     """The inertia by another response of a joint whose model is known: one search, which begins there."""
-    model = _Model(_used(found), found.period_s, before.flexible)
     joint = before.joint()
+    model = _Model(_used(found), found.period_s, before.flexible, joint.link_kgm2 / joint.motor_kgm2)
     late = [math.log(max(before.values[name].value, 2e-5)) for name in ("delay_s", "lag_s")]
     start = [math.log(before.inertia_kgm2.value), *late, before.friction_Nmspr.value]
     if before.flexible:
@@ -286,7 +313,8 @@ def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
     half = width * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, cov, slopes), 0.0))
     found = {}
     for name, value, own in zip(_VALUES, centre, half, strict=True):
-        besides = MODEL_LATE_s if name == "late_s" else MODEL_SHARES.get(name, 0.0) * value
+        late_s = MODEL_LATE_s if model.tells_link else UNSEEN_LATE_s
+        besides = late_s if name == "late_s" else MODEL_SHARES.get(name, 0.0) * value
         found[name] = Estimate(float(value), math.hypot(own, besides))
     return found
 
@@ -377,6 +405,9 @@ def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
         return values
     joint = fit.joint()
     values.append(found("reducer", "motor_inertia_kgm2", fit.link_kgm2, joint.motor_kgm2))
+    if not fit.tells_link:
+        remark = f"{joint.motor_kgm2:.3g}, a share that the encoder on the link does not tell"
+        values[-1] = replace(values[-1], source=remark)
     values.append(found("reducer", "loop_stiffness_Nmprad", fit.stiffness_Nmprad))
     if config.reducer is None:
         steady = rounded(fit.stiffness_Nmprad.value / SMALL_MOTION)

@@ -72,7 +72,7 @@ def response(
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, measured_response, response_task
     from jointctl.tools.tuning.frequency_response import bode_figure
-    from jointctl.tools.tuning.joint_fit import fit_joint
+    from jointctl.tools.tuning.joint_fit import configured_ratio, fit_joint
     from jointctl.tools.written_file import replace_file, require_target
 
     picture, file = figure or Path(f"{config.path.stem}.response.png"), out or Path(f"{config.path.stem}.response.json")
@@ -96,7 +96,7 @@ def response(
             return never_begun(ended.drive_state, output, dry_run=dry_run)
     result, fit = found.to_dict(), None
     try:
-        fit = fit_joint(found, config.joint.inertia_kgm2)
+        fit = fit_joint(found, config.joint.inertia_kgm2, configured_ratio(config))
         result["fit"] = fit.to_dict()
     finally:  # what was measured is kept where no model fits
         replace_file(file, json.dumps(result, indent=1).encode())
@@ -127,6 +127,8 @@ def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
         if not fit.flexible and name in OF_A_REDUCER:
             continue
         configured = known.get(name)
+        if name == "link_kgm2" and not fit.tells_link:
+            remark = "believed: not seen from the link"
         table.add_row(
             label, f"{scale * one.value:.4g}", f"{scale * one.half:.2g}",
             "" if configured is None else f"{scale * configured:.4g}", remark,

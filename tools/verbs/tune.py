@@ -12,16 +12,16 @@ import typer
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
 from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
 
-LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders"), ("tracking", "settling", "quiet")
+LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders", "link_encoder"), ("tracking", "settling", "quiet")
 
 
 @dataclass(frozen=True)
 class TuneOptions:
     """What `tune` may do, and what it is after."""
 
-    law: Annotated[str, typer.Option("--law", help="paper, precise, two_encoders, or auto: what the joint allows")] = (
-        "auto"
-    )
+    law: Annotated[
+        str, typer.Option("--law", help="paper, precise, two_encoders, link_encoder, or auto: what the joint allows")
+    ] = "auto"
     objective: Annotated[str, typer.Option("--objective", help="tracking, settling or quiet")] = "tracking"
     torque_Nm: Annotated[
         float | None,

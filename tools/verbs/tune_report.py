@@ -1,4 +1,4 @@
-"""What a tune leaves for its user: the tables of the terminal, and the report of one page."""
+"""What a tune leaves for its user: the values of the file, the tables of the terminal, and the report of one page."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import map_figure
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.found_values import Found, rounded
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
@@ -24,6 +25,57 @@ if TYPE_CHECKING:
 GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz")  # that are shown
 
 
+def values_of(job: Tune) -> list[Found]:
+    """Everything that the file gets."""
+    assert job.fit is not None
+    gains = job.state["gains"]
+    objective = f"{job.options.objective}, law {gains['law']}, worst phase margin {gains['phase_margin_deg']:.0f} deg"
+    values = [*job.fitted(), *job.gravity_values()]
+    before, after = job.original.control.model_dump(), job.config.control.model_dump()
+    for key, value in after.items():
+        if key not in ("learning", "adaptation") and value != before[key]:
+            source = f"{value}, {objective}"
+            values.append(Found(("control",), key, value[0] if key == "lyapunov_q" else value, source))
+    if before["learning"] != after["learning"]:
+        if after["learning"] is None:
+            values.append(Found(("control",), "learning", None, "none: it would not converge, or the law has none"))
+        for key, value in (after["learning"] or {}).items():
+            values.append(Found(("control", "learning"), key, value, ""))
+    if before["adaptation"] != after["adaptation"]:
+        if after["adaptation"] is None:
+            values.append(Found(("control",), "adaptation", None, "none"))
+        for key, value in (after["adaptation"] or {}).items():
+            source = f"{value}, of friction that adapts to the joint, with the law {gains['law']}"
+            values.append(Found(("control", "adaptation"), key, value, source if key == "reach" else ""))
+    friction = job.state["friction"]
+    for key, value in friction["section"].items():
+        if isinstance(value, dict):
+            values += [Found(("friction", key), name, number, "") for name, number in value.items()]
+        else:
+            values.append(Found(("friction",), key, value, ""))
+    values += [Found(("reducer", "map"), key, value, "") for key, value in job.state["map"].items()]
+    second, chosen = job.original.joint_encoder, job.config.joint_encoder
+    if second is not None and chosen is not None and second.law != chosen.law:
+        values.append(Found(("joint_encoder",), "law", chosen.law, f"{chosen.law}, of the law {gains['law']}"))
+    virtual = job.config.virtual
+    if virtual is not None and virtual != job.original.virtual:
+        kept = "the virtual joint stays what it was"
+        values.append(Found(("virtual",), "inertia_scale", rounded(virtual.inertia_scale), kept))
+        if job.original.virtual is not None and job.original.virtual.friction is None and virtual.friction:
+            values += _nested(("virtual", "friction"), virtual.friction.model_dump(exclude_none=True))
+    return values
+
+
+def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
+    found: list[Found] = []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            found += _nested((*section, key), value)
+        else:
+            found.append(Found(section, key, value, ""))
+    return found
+
+
 def _tables(job: Tune) -> tuple[Table, Table]:
     """What was found, and loop and tracking before and after."""
     assert job.fit is not None
@@ -34,7 +86,7 @@ def _tables(job: Tune) -> tuple[Table, Table]:
         title_justify="left", caption_justify="left",
         caption="margins of the joint that was found, as `check` has them; error from 5 s on, as the encoder shows it",
     )  # fmt: skip
-    both = [_margins_or_none(config) for config in (_before_on_found(job), job.config)]
+    both = [_margins_or_none(config) for config in (job.before_on_found(), job.config)]
     for name, key, form in (
         ("phase margin [deg]", "phase_margin_deg", ".1f"), ("gain margin up", "gain_margin_up", ".2f"),
         ("largest |S|", "sensitivity_peak", ".2f"),
@@ -51,10 +103,6 @@ def _tables(job: Tune) -> tuple[Table, Table]:
     for name in gains["missed"]:
         table.add_row("missed", "", name)
     return fit_table(job.original, job.response, job.fit), table
-
-
-def _before_on_found(job: Tune) -> Config:
-    return job.config.model_copy(update={"control": job.original.control, "joint_encoder": job.original.joint_encoder})
 
 
 def write_report(job: Tune, values: list[list[Any]]) -> None:

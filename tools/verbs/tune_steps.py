@@ -16,7 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
+from jointctl.drivers.errors import (
+    DataError,
+    JointctlError,
+    LimitCycle,
+    MarginError,
+    MotionFault,
+    TooFewPoints,
+    UsageError,
+)
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -61,18 +69,25 @@ from jointctl.tools.tuning.carry_out import (
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
 from jointctl.tools.tuning.gains import (
-    TWO_ENCODERS,
     ChosenGains,
+    apart,
     choose_gains,
-    has_both_encoders,
+    require_encoders,
     with_slow_observer,
 )
-from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint, gravity_of, values_of_fit
+from jointctl.tools.tuning.joint_fit import (
+    JointFit,
+    configured_ratio,
+    fit_from_dict,
+    fit_joint,
+    gravity_of,
+    values_of_fit,
+)
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
-from jointctl.tools.verbs.tune_report import write_report
+from jointctl.tools.verbs.tune_report import values_of, write_report
 from jointctl.tools.written_file import replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
@@ -83,7 +98,8 @@ MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_L
 FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
-SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
+SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
+SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the next where the slow ones swing
 SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
 SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_FROM_s = 5.0
@@ -112,8 +128,7 @@ class Tune:
     def __post_init__(self) -> None:
         limits, torque_Nm = self.original.limits, self.options.torque_Nm
         self.config = self.original
-        if self.options.law == "two_encoders" and not has_both_encoders(self.original):
-            raise ConfigurationError(f"{self.original.path}: --law (=two_encoders) needs {TWO_ENCODERS}")
+        require_encoders(self.original, self.options.law)
         if torque_Nm is not None:
             if not 0.0 < torque_Nm <= limits.torque_max_Nm:
                 raise UsageError(
@@ -256,7 +271,7 @@ class Tune:
             found, records, plan = measured_response(task, self.carrier)
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
-        fit = fit_joint(found, config.joint.inertia_kgm2)
+        fit = fit_joint(found, config.joint.inertia_kgm2, configured_ratio(config))
         require_one_joint(task, plan, records, fit)
         return {**found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found}
 
@@ -282,7 +297,7 @@ class Tune:
 
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
-        self.config = with_values(self.config, self._fitted())
+        self.config = with_values(self.config, self.fitted())
         self.carrier.output.note(
             f"  {'two masses' if self.fit.flexible else 'rigid'}, {self.fit.inertia_kgm2.value:.4g} kg m^2, "
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
@@ -290,7 +305,7 @@ class Tune:
         # for the motions that measure: at low speed a softer law sticks, and no plateau settles
         self.config = self._with_control(self.chosen_gains(self.options.law, "tracking").control)
 
-    def _fitted(self) -> list[Found]:
+    def fitted(self) -> list[Found]:
         assert self.fit is not None
         assert self.response is not None
         source = f"95 %, response of {self.response.legs} legs at {self.response.peak_Nm:.2g} Nm"
@@ -319,9 +334,9 @@ class Tune:
             f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else "  none that can be told"
         )
         if kept["found"]:
-            self.config = with_values(self.config, self._gravity_values())
+            self.config = with_values(self.config, self.gravity_values())
 
-    def _gravity_values(self) -> list[Found]:
+    def gravity_values(self) -> list[Found]:
         kept = self.state["gravity"]
         if not kept["found"]:
             return []
@@ -341,10 +356,36 @@ class Tune:
         )  # fmt: skip
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
         top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
-        options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
-        command = Sweep(self._sliding(), self.carrier.quietly(), path, options)
+        commands, config, seconds = [], self._sliding(), 0.0
+        for ratio in SWEEP_RATIOS:
+            fitting = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / ratio)
+            commands.append(Sweep(config, self.carrier.quietly(), path, fitting))
+        if self.options.resume:
+            begun = [k for k, one in enumerate(commands) if measured_before(path, one.plan.hash)]
+            commands = commands[max(begun, default=0) :]
+        for command in commands:
+            try:
+                self._sweep(command)
+                found = self.found_friction = self.identified()
+                break
+            except (LimitCycle, TooFewPoints) as error:
+                if command is commands[-1]:
+                    raise
+                self.carrier.output.note(f"  {error.message}: once more without the slowest plateaus")
+            finally:
+                seconds += command.file.elapsed_s if command.file is not None else 0.0
+        static = static_friction_Nm(self.config)
+        return {
+            "section": section_values(found.branches["positive"], found.branches["negative"]),
+            "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model, "static_before": static,
+            "seconds": seconds,
+        }  # fmt: skip
+
+    def _sweep(self, command: Sweep) -> None:
+        """Measure what is not measured yet; `NotCarriedOut` where somebody stopped it."""
+        path = command.out
         if self.options.resume and measured_before(path, command.plan.hash):
-            command.options = replace(options, resume=True)
+            command.options = replace(command.options, resume=True)
         else:
             for old in (path, path.with_suffix(".json")):
                 old.unlink(missing_ok=True)
@@ -355,13 +396,6 @@ class Tune:
             self.carrier.drive_state = command.drive_state or self.carrier.drive_state
         if ended:
             raise NotCarriedOut(command.drive_state, "" if control is None else control.signals.stopped_by)
-        found = self.found_friction = self.identified()
-        static = static_friction_Nm(self.config)
-        return {
-            "section": section_values(found.branches["positive"], found.branches["negative"]),
-            "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model, "static_before": static,
-            "seconds": command.file.elapsed_s if command.file is not None else 0.0,
-        }  # fmt: skip
 
     def identified(self) -> Identification:
         return identify_friction(read_friction_data(self.folder / "friction.csv", None), Options(swarm=SWARM))
@@ -444,6 +478,7 @@ class Tune:
         self._require_same_joint("after the verification")
         before = self._before()
         try:
+            require_margin(self.before_on_found())  # the file as it was may know of no soft reducer
             require_margin(before)
         except JointctlError as error:
             return {**found, "before_refused": error.message}
@@ -468,6 +503,11 @@ class Tune:
             scale = virtual.inertia_scale * self.config.joint.inertia_kgm2 / joint.inertia_kgm2
             found = found.model_copy(update={"virtual": virtual.model_copy(update={"inertia_scale": scale})})
         return found.model_copy(update={"reducer": self.original.reducer, "joint_encoder": self.original.joint_encoder})
+
+    def before_on_found(self) -> Config:
+        """The law as it was, on everything that was found."""
+        second = self.original.joint_encoder
+        return self.config.model_copy(update={"control": self.original.control, "joint_encoder": second})
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
         seconds = self.verifying.duration_s
@@ -497,7 +537,7 @@ class Tune:
         for one in sorted(allowed, key=lambda one: one.error):
             if len(runs) == REFINE_RUNS:
                 break
-            if all(_apart(one.settings, other.settings) > REFINE_APART for other in tried):
+            if all(apart(one.settings, other.settings) > REFINE_APART for other in tried):
                 tried.append(one)
                 control = gains.with_gains(one)
                 found = self._verified(self._with_control(control), "refinement")
@@ -513,50 +553,8 @@ class Tune:
 
     # --- 9. what is written ---
 
-    def _values(self) -> list[Found]:
-        """Everything that the file gets."""
-        assert self.fit is not None
-        gains = self.state["gains"]
-        objective = (
-            f"{self.options.objective}, law {gains['law']}, worst phase margin {gains['phase_margin_deg']:.0f} deg"
-        )
-        values = [*self._fitted(), *self._gravity_values()]
-        before, after = self.original.control.model_dump(), self.config.control.model_dump()
-        for key, value in after.items():
-            if key not in ("learning", "adaptation") and value != before[key]:
-                source = f"{value}, {objective}"
-                values.append(Found(("control",), key, value[0] if key == "lyapunov_q" else value, source))
-        if before["learning"] != after["learning"]:
-            if after["learning"] is None:
-                values.append(Found(("control",), "learning", None, "none: it would not converge, or the law has none"))
-            for key, value in (after["learning"] or {}).items():
-                values.append(Found(("control", "learning"), key, value, ""))
-        if before["adaptation"] != after["adaptation"]:
-            if after["adaptation"] is None:
-                values.append(Found(("control",), "adaptation", None, "none"))
-            for key, value in (after["adaptation"] or {}).items():
-                source = f"{value}, of friction that adapts to the joint, with the law {gains['law']}"
-                values.append(Found(("control", "adaptation"), key, value, source if key == "reach" else ""))
-        friction = self.state["friction"]
-        for key, value in friction["section"].items():
-            if isinstance(value, dict):
-                values += [Found(("friction", key), name, number, "") for name, number in value.items()]
-            else:
-                values.append(Found(("friction",), key, value, ""))
-        values += [Found(("reducer", "map"), key, value, "") for key, value in self.state["map"].items()]
-        second, chosen = self.original.joint_encoder, self.config.joint_encoder
-        if second is not None and chosen is not None and second.law != chosen.law:
-            values.append(Found(("joint_encoder",), "law", chosen.law, f"{chosen.law}, of the law {gains['law']}"))
-        virtual = self.config.virtual
-        if virtual is not None and virtual != self.original.virtual:
-            kept = "the virtual joint stays what it was"
-            values.append(Found(("virtual",), "inertia_scale", rounded(virtual.inertia_scale), kept))
-            if self.original.virtual is not None and self.original.virtual.friction is None and virtual.friction:
-                values += _nested(("virtual", "friction"), virtual.friction.model_dump(exclude_none=True))
-        return values
-
     def _write(self, text: str) -> None:
-        values = self._values()
+        values = values_of(self)
         friction = self.state["friction"]
         sources: dict[str, list[str]] = {}
         for one in values:
@@ -570,25 +568,9 @@ class Tune:
         replace_file(self.folder / "before.toml", text.encode())
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
-        write_report(self, [[".".join(one.section), one.key, one.value] for one in self._values()])
+        write_report(self, [[".".join(one.section), one.key, one.value] for one in values_of(self)])
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
-
-
-def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
-    found: list[Found] = []
-    for key, value in values.items():
-        if isinstance(value, dict):
-            found += _nested((*section, key), value)
-        else:
-            found.append(Found(section, key, value, ""))
-    return found
 
 
 def _require_valid(path: Path) -> None:
     load_config(path)
-
-
-def _apart(one: Any, other: Any) -> float:
-    """Greatest relative difference of the gains."""
-    pairs = [(getattr(one, key), getattr(other, key)) for key in ("kv", "observer_radps", "cutoff_Hz")]
-    return max((abs(math.log(a / b)) for a, b in pairs if a > 0.0 and b > 0.0), default=0.0)

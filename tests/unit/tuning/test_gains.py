@@ -9,7 +9,7 @@ import pytest
 import tomlkit
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
@@ -19,6 +19,7 @@ from jointctl.tools.tuning.gains import (
     PHASE_MARGIN_deg,
     choose_gains,
     converging,
+    identified_joints,
     lossless_joints,
     steady_joints,
     with_slow_observer,
@@ -88,6 +89,29 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     assert found.best.settings.observer_radps < 120.0
     assert found.best.noise_Nm < 0.61  # 1.8 Nm were 3 % of this joint's torque
     assert found.control.adaptation is not None
+
+
+def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_resonance() -> None:
+    fit = replace(fit_of(2.1, 1.8e-3, 1.1, 2.6e4), tells_link=False)
+    config = known(shipped("realistic", joint_encoder=None, encoder__side="joint"), fit)
+    found = choose_gains(config, fit)
+    assert (found.law, found.control.kind, found.missed) == ("link_encoder", "flexible_joint", {})
+    assert found.control.velocity_cutoff_Hz < 0.5 * fit.resonance_Hz.value
+    settings, _ = loop_settings(changed(config, control=found.control))
+    assert margins(settings).phase_margin_deg >= config.margin.min_phase_margin_deg
+    hardly_damped = margins(replace(settings, joints=tuple(lossless_joints(config))))
+    assert hardly_damped.phase_margin_deg >= 0.5 * config.margin.min_phase_margin_deg
+
+
+def test_a_share_that_was_not_seen_may_be_any_and_leaves_the_resonance() -> None:
+    fit = replace(fit_of(2.1, 1.8e-3, 1.1, 2.6e4), tells_link=False)
+    estimates = {**fit.values, "link_kgm2": Estimate(1.1, 0.5), "resonance_Hz": Estimate(fit.resonance_Hz.value, 0.0)}
+    config = known(shipped("realistic", margin__payload_range=(1.0, 1.0)), fit)
+    joints = [one for one in identified_joints(config, replace(fit, values=estimates)) if isinstance(one, TwoMasses)]
+    assert [min(one.link_kgm2 for one in joints), max(one.link_kgm2 for one in joints)] == pytest.approx([0.6, 1.6])
+    unseen = [one for one in joints if one.link_kgm2 != pytest.approx(1.1)]
+    assert [one.motor_kgm2 + one.link_kgm2 for one in unseen] == pytest.approx([2.1] * 4)
+    assert [one.resonance_Hz for one in unseen] == pytest.approx([fit.resonance_Hz.value] * 4, rel=0.06)
 
 
 def test_the_slower_observer_of_a_soft_joint_passes_the_gate_where_it_is_later_than_was_found() -> None:
@@ -182,10 +206,20 @@ def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing(
     assert not others
 
 
-def test_two_encoders_are_refused_where_there_is_one() -> None:
-    fit = fit_of(2.0, 1.5e-3)
-    with pytest.raises(ConfigurationError, match=r"--law \(=two_encoders\) needs \[joint_encoder\]"):
-        choose_gains(known(shipped("precise"), fit), fit, "two_encoders")
+@pytest.mark.parametrize(
+    ("name", "law", "link_kgm2", "words"),
+    [
+        ("precise", "two_encoders", 0.0, r"needs \[joint_encoder\]"),
+        ("realistic", "link_encoder", 1.1, r'needs encoder.side = "joint" and no \[joint_encoder\]'),
+        ("realistic", "two_encoders", 0.0, "needs a reducer that is seen to be soft"),
+    ],
+)
+def test_a_law_for_other_encoders_or_a_soft_reducer_is_refused(
+    name: str, law: str, link_kgm2: float, words: str
+) -> None:
+    fit = fit_of(2.1, 1.5e-3, link_kgm2, 2.6e4 if link_kgm2 else 0.0)
+    with pytest.raises(ConfigurationError, match=rf"--law \(={law}\) {words}"):
+        choose_gains(known(shipped(name), fit), fit, law)
 
 
 def test_a_better_belief_does_not_move_the_virtual_joint() -> None:
