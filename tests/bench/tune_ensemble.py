@@ -1,14 +1,15 @@
 """`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
 
-    python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft] [--workers 2] [--csv FILE]
-                                       [--motions] [--cluster tls://HOST:8786]
+    python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft | --light] [--encoders both]
+                                       [--workers 2] [--csv FILE] [--motions] [--cluster tls://HOST:8786]
 
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
-reducer and two encoders) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no
-reducer, and the delay of the shipped configuration.  Simulated time.  The same law is chosen a second time from the
-true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s, and once more
-until 60 s, when what adapts has found its weights.  `--motions`: what
-was tuned also makes the runs of `flexible_study.py`, with learning and with adaptation, motions that never repeat.
+reducer and two encoders, or one of them, `--encoders`; `--light`: rigid, light, with much friction) begins with an
+inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no reducer, and the delay of the shipped
+configuration.  Simulated time.  The same law is chosen a second time from the true values, and both run
+0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s, and once more until 60 s, when what adapts
+has found its weights.  `--motions`: what was tuned also makes the runs of `flexible_study.py`, with learning and with
+adaptation, motions that never repeat.
 
 Hysteresis leaves a reducer no single stiffness.  The one that is compared is what the virtual reducer did in the
 response itself: its torque over its twist, both of the simulation and by the lines of the excitation, as the analysis
@@ -68,6 +69,7 @@ RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
 IN_LOCKSTEP = sweeping.sweep_in_lockstep
 LAWS: dict[str, Any] = {"both": "joint_encoder", "motor": "encoder", "link": "joint_encoder_alone"}  # of `study`
+LIGHT_kgm2, LIGHT_FRICTION = (0.08, 0.6), (0.3, 1.0)  # total inertia; share of the friction of a joint of 2 kg m^2
 HELD_LINK = ((0.0, 1e4), (0.0, 200.0))  # of a rigid joint: a link that nothing moves
 
 
@@ -243,11 +245,23 @@ def rmse_mrad(config: Config) -> tuple[float, float]:
     return early, late
 
 
-def tuned(task: tuple[int, int, bool, str, bool]) -> dict[str, Any]:
+def unloaded(plant: Config, seed: int, index: int) -> Config:
+    """A light joint with much friction for its inertia, such as a motor and its reducer on the bench alone."""
+    random = np.random.default_rng([seed, index, 7])
+    inertia, factor = math.exp(random.uniform(*np.log(LIGHT_kgm2))), float(random.uniform(*LIGHT_FRICTION))
+    assert plant.friction is not None
+    joint = plant.joint.model_copy(update={"inertia_kgm2": inertia})
+    return plant.model_copy(update={"joint": joint, "friction": scaled(plant.friction, factor, factor)})
+
+
+def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     """One joint; with `failed` where it was not tuned."""
-    seed, index, soft, encoders, motions = task
+    seed, index, kind, encoders, motions = task
+    soft = kind == "soft"
     base = load_config(shipped_config("realistic" if soft else "precise"))
     plant = random_plant(base, EnsembleSettings(flexible=soft, law=LAWS[encoders]), seed, index)
+    if kind == "light":
+        plant = unloaded(plant, seed, index)
     if encoders == "motor":
         plant = plant.model_copy(update={"joint_encoder": None})
     assert plant.virtual is not None
@@ -297,6 +311,8 @@ def tuned(task: tuple[int, int, bool, str, bool]) -> dict[str, Any]:
     row["true_margin_deg"] = true_margin_deg(job.config, true_kgm2)
     row["rmse_mrad"], row["late_rmse_mrad"] = rmse_mrad(job.config)
     row["rmse_before_mrad"] = job.state["verification"].get("before", {}).get("rmse_mrad", math.nan)
+    if fit.flexible != soft:  # its law is none of the true joint
+        return {**row, "rmse_true_mrad": math.nan, "late_rmse_true_mrad": math.nan}
     truth = true_fit(plant, fit, true_kgm2, local)
     known = with_values(job.config, values_of_fit(job.config, truth, ""))
     assert plant.friction is not None
@@ -326,14 +342,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=90701)
     parser.add_argument("--plants", type=int, default=40)
-    parser.add_argument("--soft", action="store_true")
+    kinds = parser.add_mutually_exclusive_group()
+    for kind in ("soft", "light"):
+        kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, default="rigid")
     parser.add_argument("--encoders", choices=tuple(LAWS), default="both", help="of a soft joint; default: both")
     parser.add_argument("--motions", action="store_true")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler: docs/cluster.md")
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
-    tasks = [(given.seed, index, given.soft, given.encoders, given.motions) for index in range(given.plants)]
+    tasks = [(given.seed, index, given.kind, given.encoders, given.motions) for index in range(given.plants)]
     rows: list[dict[str, Any]] = []
     for row in Workers(given.workers, given.cluster).results(tuned, tasks):
         rows.append(row)
@@ -349,7 +367,7 @@ def main() -> None:
             writer = csv.DictWriter(file, sorted({key for row in rows for key in row}))
             writer.writeheader()
             writer.writerows(rows)
-    print(f"{len(good)} of {len(rows)} tuned, seed {given.seed}, {'soft' if given.soft else 'rigid'}; simulated")
+    print(f"{len(good)} of {len(rows)} tuned, seed {given.seed}, {given.kind}; simulated")
     for name in ("inertia", "link", "resonance", "stiffness", "stiffness_over_first", "late_ms", "rmse_mrad",
                  "rmse_true_mrad", "ratio", "late_rmse_mrad", "late_rmse_true_mrad", "late_ratio", "joint_s",
                  "computing_s", "cpu_s"):  # fmt: skip

@@ -25,7 +25,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
-from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.tuning.carry_out import FED_STIFF, Carrier
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
@@ -95,6 +95,21 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
     folder = wrong.with_suffix(".tune")
     assert "Bode plot" in (folder / "report.html").read_text()
     assert (folder / "before.toml").read_text() == text
+
+
+def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_response(tmp_path: Path) -> None:
+    """0.3 kg m^2 that break away at 10 Nm, taken for 0.5: a weak law swung or stood, and 9 Nm would turn it round."""
+    path = written(
+        tmp_path / "light.toml", "precise", joint__inertia_kgm2=0.5, virtual__inertia_scale=0.6,
+        virtual__friction_positive_scale=0.55, virtual__friction_negative_scale=0.5,
+    )  # fmt: skip
+    before = load_config(path)
+    output, out, _ = outputs()
+    assert tune(before, output, options=TuneOptions(lockstep=True)) == 0
+    found, tuned = json.loads(out.getvalue()), load_config(path)
+    assert found["response"]["law"] == FED_STIFF
+    assert tuned.joint.inertia_kgm2 == pytest.approx(0.3, rel=0.08)
+    assert found["verification"]["after"]["rmse_mrad"] < 0.2
 
 
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ class RunResult:
     name: str = ""  # of the joint, where it is one of several
     others: tuple[RunResult, ...] = ()  # the other joints of an arm
     fault_slot_ns: int = 0  # the loop's time of the fault
+    fault_value: float = 0.0  # that tripped the limit
 
     @property
     def joints(self) -> tuple[RunResult, ...]:

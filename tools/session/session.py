@@ -375,4 +375,5 @@ class Session:
             report=report,
             name=watch.joint.name,
             fault_slot_ns=int(state.fault_slot_ns),
+            fault_value=float(state.fault_value),
         )

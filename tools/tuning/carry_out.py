@@ -7,6 +7,7 @@ simulated time as well.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.found_values import Found, rounded, with_values
+from jointctl.tools.configuration.found_values import Found, rounded, with_sliding, with_values
 from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
 from jointctl.tools.configuration.sections import MinJerk, Trajectory
 from jointctl.tools.lockstep import LockstepJoint
@@ -41,10 +42,14 @@ from jointctl.tools.session.session import Session
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
     LEAST_SHARE,
+    STIFF,
+    WEAK,
     FrequencyResponse,
     Multisine,
+    ResponseLaw,
     ResponseMotion,
     ResponsePlan,
+    SPEED_radps,
     config_of_response,
     grown,
     largest_peak_Nm,
@@ -56,8 +61,8 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
 
 
-class StoodStill(MotionFault):
-    """POSITION_FROZEN of a joint that was hardly pushed: the law is too weak for its friction."""
+class TooWeak(MotionFault):
+    """A joint that stood, stayed behind or swung slowly, hardly pushed: the law is too weak for its friction."""
 
 
 class NotCarriedOut(Exception):
@@ -76,6 +81,7 @@ class Carried:
     fault: Fault
     text: FaultText | None
     log: str  # "" in simulated time
+    value: float = 0.0  # that tripped the limit of the fault
 
 
 def _ended(title: str, carried: Carried) -> MotionFault:
@@ -118,8 +124,9 @@ class Carrier:
         motion.require_start(joint.report.start_position_rad)
         run = joint.run_as_configured(placed.constants, placed.table)
         self.drive_state = PowerState(int(run.device.state)).name.lower().replace("_", " ")
-        text = fault_text(run.fault, float(run.state.fault_value), 0) if run.fault is not Fault.NONE else None
-        return Carried(run.log, run.fault, text, "")
+        value = float(run.state.fault_value)
+        text = fault_text(run.fault, value, 0) if run.fault is not Fault.NONE else None
+        return Carried(run.log, run.fault, text, "", value)
 
     def _moved(self, config: Config, motion: Motion, title: str) -> Carried:
         assert self.control is not None
@@ -142,7 +149,8 @@ class Carrier:
             raise NotCarriedOut(session.drive_state, result.stopped_by)
         if result.lost_records:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
-        return Carried(read_run_log(result.log_path).records, result.fault, result.fault_text, str(result.log_path))
+        records = read_run_log(result.log_path).records
+        return Carried(records, result.fault, result.fault_text, str(result.log_path), result.fault_value)
 
 
 class ShownConsent(TerminalConsent):
@@ -204,6 +212,8 @@ LEAST_LEGS, MOST_LEGS = 8, 100
 STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
 GROWTH = 2.0  # of the torque from stage to stage
 ENOUGH_COHERENCE = 0.98  # median over the lines
+HUNTING_Hz = 8.0  # between sticking and sliding, below it; a resonance swings above, and a stiffer law would feed it
+PUSHED_s = 0.5  # before the end, in which no torque was more
 STANDS_SHARE = 0.1  # of the way of the reference: what the other encoder may show of a joint that stands
 TOO_WEAK = "the law may be too weak for the friction where joint.inertia_kgm2 (={:g}) is too small"
 RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
@@ -224,18 +234,18 @@ class ResponseTask:
         return ResponseMotion(self.config, plan, self.largest_Nm)
 
 
-def response_task(config: Config, torque_Nm: float | None, legs: int) -> ResponseTask:
+def response_task(config: Config, torque_Nm: float | None, legs: int, law: ResponseLaw = WEAK) -> ResponseTask:
     """`torque_Nm` at most, None: what fits the joint; `UsageError` where they or the limits do not fit.
 
-    With the weak law, or with that of the configuration where the gate refuses the weak one: on a joint that is known
-    to be soft, with a light motor and a long delay.
+    With that law, or with that of the configuration where the gate refuses it: on a joint that is known to be soft,
+    with a light motor and a long delay.
     """
     if not LEAST_LEGS <= legs <= MOST_LEGS:
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
-    moving = config_of_response(config, torque_Nm)
+    moving = config_of_response(config, torque_Nm, law)
     with contextlib.suppress(ConfigurationError):  # a law whose margins are not known: the gate says so later
         if not meets(margins(loop_settings(moving)[0]), moving.margin.min_phase_margin_deg):
-            moving = config_of_response(config, torque_Nm, own_law=True)
+            moving = config_of_response(config, torque_Nm, None)
     _, length_s = speed_and_period(moving)
     return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), legs // 2, largest_peak_Nm(moving))
 
@@ -260,6 +270,41 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     return found, records, plan
 
 
+# --- the laws of a response whose joint has a friction that is not known yet ---
+# A law for an inertia that is believed too small, or for a light joint with much friction, turns the torque round too
+# late where a leg ends.
+
+ALONE, FED, FED_STIFF = "the weak law", "a part of the friction fed forward", "a stiffer law, friction fed forward"
+_LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF}
+_LITTLE_FRICTION, _MUCH_FRICTION = (ALONE, FED, FED_STIFF), (FED_STIFF, FED)
+MUCH_FRICTION_radps2 = 25.0  # torque to break away over the inertia that is believed
+FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
+
+
+def task_by(law: str, before: Config, break_away_Nm: float, legs: int) -> ResponseTask:
+    """By one of these laws; `before`: the configuration without a friction that is fed forward."""
+    if law != ALONE and break_away_Nm > 0.0:
+        fed_Nm = FED_SHARE * break_away_Nm
+        before = with_sliding(before, break_away_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
+    return response_task(before, None, legs, _LAWS[law])
+
+
+def response_by_any_law(
+    before: Config, break_away_Nm: float, legs: int, carrier: Carrier
+) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
+    """(law, its task, what it measured), with the next law where one is too weak; faults as `measured_response`."""
+    much = break_away_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
+    laws = _MUCH_FRICTION if much else _LITTLE_FRICTION
+    for law, after in itertools.pairwise(laws):
+        task = task_by(law, before, break_away_Nm, legs)
+        try:
+            return law, task, measured_response(task, carrier)
+        except TooWeak as error:
+            carrier.output.note(f"  {error.message}: once more, {after}")
+    task = task_by(laws[-1], before, break_away_Nm, legs)
+    return laws[-1], task, measured_response(task, carrier)
+
+
 def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarray, fit: JointFit) -> None:
     """`MotionFault` where the halves of the legs are of two joints; where too few legs are left nothing is compared."""
     parts = [replace(plan, legs=replace(plan.legs, starts=starts)) for starts in np.array_split(plan.legs.starts, 2)]
@@ -268,9 +313,8 @@ def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarr
         _refuse_another("the first half of the response", first, "in the second half", second)
 
 
-def require_same_joint(config: Config, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
+def require_same_joint(task: ResponseTask, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
     """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
-    task = response_task(config, None, LEAST_LEGS)
     peak_Nm = min(peak_Nm, task.largest_Nm)
     inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
     _refuse_another("the response", fit.inertia_kgm2, when, inertia)
@@ -293,7 +337,8 @@ def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
     except DataError:
         return task
     config = with_values(task.config, [Found(("joint",), "inertia_kgm2", rounded(inertia), "")])
-    return replace(task, config=config)
+    shown_Nm = task.largest_Nm
+    return replace(task, config=config, largest_Nm=min(shown_Nm, largest_peak_Nm(config)))
 
 
 def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
@@ -306,17 +351,25 @@ def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
         )
 
 
-def _stood_still(config: Config, carried: Carried) -> bool:
-    """Whether both encoders stood while the reference went too far, under a torque that a joint may stand under."""
+def _too_weak(config: Config, carried: Carried, peak_Nm: float) -> bool:
+    """Whether it stood, stayed behind or swung as friction does, under no more torque than a joint may stand under.
+
+    Under more it is against something, and a stiffer law would push it harder; `peak_Nm` of the excitation.
+    """
     phase = carried.records.phase
     rows = carried.records[(phase >= AxisPhase.APPROACH) & (phase <= AxisPhase.TRACKING)]
-    if carried.fault != Fault.POSITION_FROZEN or config.joint_encoder is None or not len(rows):
+    if not len(rows):
         return False
-    limits = axis_constants(config, trajectory_table(config))[0].limits
-    moved = np.abs(rows.position_rad - rows.position_rad[-1]) > limits.frozen_tolerance_rad
-    stands = rows[np.flatnonzero(moved)[-1] + 1 :] if np.any(moved) else rows
-    other_rad, way_rad = np.ptp(stands.second_position_rad), np.ptp(stands.desired_position_rad)
-    return bool(other_rad < STANDS_SHARE * way_rad and abs(rows.command_torque_Nm[-1]) < limits.frozen_torque_Nm)
+    limits, torque_Nm = axis_constants(config, trajectory_table(config))[0].limits, np.abs(rows.command_torque_Nm)
+    if carried.fault == Fault.POSITION_FROZEN:
+        moved = np.abs(rows.position_rad - rows.position_rad[-1]) > limits.frozen_tolerance_rad
+        stands = rows[np.flatnonzero(moved)[-1] + 1 :] if np.any(moved) else rows
+        way_rad = np.ptp(stands.desired_position_rad)
+        other_rad = 0.0 if config.joint_encoder is None else np.ptp(stands.second_position_rad)
+        return bool(other_rad < STANDS_SHARE * way_rad and torque_Nm[-1] < limits.frozen_torque_Nm)
+    slow = carried.fault == Fault.LIMIT_CYCLE and carried.value < HUNTING_Hz
+    pushed_Nm = np.max(torque_Nm[-round(PUSHED_s * config.loop.rate_Hz) :]) - peak_Nm
+    return bool((slow or carried.fault == Fault.FOLLOWING_ERROR) and pushed_Nm < limits.frozen_torque_Nm)
 
 
 def _stage(
@@ -330,8 +383,8 @@ def _stage(
         carried = carrier.run(task.config, motion, title, also_faults=True)
         if carried.text is not None:
             ended = _ended(title, carried)
-            if _stood_still(task.config, carried):
-                raise StoodStill(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
+            if _too_weak(task.config, carried, peak_Nm):
+                raise TooWeak(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
             raise ended
         return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,9 +60,21 @@ TORQUE_SHARE = 0.15  # of limits.torque_max_Nm: peak of the multisine, unless th
 LEAST_SHARE = 1.0 / 8.0  # of that peak: where it begins
 FRICTION_SPARE = 1.2  # of the static friction, which the excitation leaves room for
 
-# the weak law; its velocity filter, at most, with an encoder behind the reducer, whose resonance a higher one excites
-KP_ps2, KV_ps, OBSERVER_radps = 100.0, 20.0, 15.0
-LINK_CUTOFF_Hz = 15.0
+LARGEST_radps2 = 8.0  # that peak over the inertia: more would turn a light joint round, and its friction with it
+
+
+class ResponseLaw(NamedTuple):
+    """Computed torque with a disturbance observer, for the excitation alone."""
+
+    kp_ps2: float
+    kv_ps: float
+    observer_radps: float
+    link_cutoff_Hz: float  # of the velocity with an encoder behind the reducer, at most: not to excite its resonance
+
+
+WEAK = ResponseLaw(100.0, 20.0, 15.0, 15.0)
+# for much friction on little inertia, under which the weak one stands or swings
+STIFF = ResponseLaw(1600.0, 80.0, 60.0, 120.0)
 
 
 @dataclass(frozen=True)
@@ -203,33 +215,34 @@ def largest_peak_Nm(config: Config) -> float:
             f"the torque (={limit:g} Nm) must be more than {holds * 1.05:.3g} Nm, what friction and gravity of the "
             "configuration take: --torque, limits.torque_max_Nm"
         )
-    return peak
+    return min(peak, LARGEST_radps2 * config.joint.inertia_kgm2)
 
 
-def config_of_response(config: Config, torque_Nm: float | None, *, own_law: bool = False) -> Config:
-    """The configuration with the torque that the user allows, and the weak law, which the motor's encoder feeds.
+def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw | None = WEAK) -> Config:
+    """The configuration with the torque that the user allows, and this law, which the motor's encoder feeds.
 
-    `own_law` of the configuration instead, without learning: for a joint that is known to be too soft for the weak one.
+    None: that of the configuration, without learning: for a joint that is known to be too soft for the weak one.
     """
     limits = config.limits
     if torque_Nm is not None and not 0.0 < torque_Nm <= limits.torque_max_Nm:
         raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
     known = config.friction is not None and config.control.feed_forward != "none"
-    law: dict[str, Any] = {"learning": None, "adaptation": None, "feed_forward": "desired" if known else "none"}
-    if not own_law:
-        law |= {
-            "kind": "computed_torque_observer", "kp": KP_ps2, "kv": KV_ps, "observer_radps": OBSERVER_radps,
+    keys: dict[str, Any] = {"learning": None, "adaptation": None, "feed_forward": "desired" if known else "none"}
+    if law is not None:
+        keys |= {
+            "kind": "computed_torque_observer", "kp": law.kp_ps2, "kv": law.kv_ps, "observer_radps": law.observer_radps,
             "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
         }  # fmt: skip
         if config.encoder.side == "joint":
-            law["velocity_cutoff_Hz"] = min(config.control.velocity_cutoff_Hz or LINK_CUTOFF_Hz, LINK_CUTOFF_Hz)
+            own_Hz = config.control.velocity_cutoff_Hz or law.link_cutoff_Hz
+            keys["velocity_cutoff_Hz"] = min(own_Hz, law.link_cutoff_Hz)
     config = with_mode(config, "torque")
-    update: dict[str, Any] = {"control": config.control.model_copy(update=law)}
+    update: dict[str, Any] = {"control": config.control.model_copy(update=keys)}
     if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:
         update["limits"] = limits.model_copy(update={"torque_max_Nm": torque_Nm})
         update["drive"] = config.drive.free_of_torque_limit()
     config = config.model_copy(update=update)
-    return config if own_law else motor_fed(config)
+    return config if law is None else motor_fed(config)
 
 
 def motor_fed(config: Config) -> Config:

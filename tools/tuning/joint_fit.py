@@ -49,6 +49,8 @@ LATEST_s = 0.012  # of delay and of lag, at most
 MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.09, "resonance_Hz": 0.05}
 MODEL_LATE_s = 1e-4
 UNSEEN_LATE_s = 6e-4  # the same where the link's encoder is alone: there is no antiresonance to tell a loss from delay
+# besides, for each rad/s^2 by which the friction over the inertia is more than `LITTLE_radps2`; `--light` there
+LITTLE_radps2, MOST_radps2, FRICTION_SHARE, FRICTION_LATE_s = 5.0, 85.0, 4.5e-3, 5.5e-6
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
            "delay_s", "lag_s", "late_s", "loss_factor")  # fmt: skip
@@ -103,6 +105,16 @@ class JointFit:
             joint = replace(joint, damping_Nmspr=joint.damping_Nmspr - lost)
         late = (self.delay_s.value, self.lag_s.value)
         return _response(joint, loss, *late, self.period_s, frequency_Hz)[side if self.flexible else "motor"]
+
+    def beside_friction(self, break_away_Nm: float) -> JointFit:
+        """Wider intervals where the friction is much for the inertia: where it slides it looks like a part of it."""
+        inertia, late = self.inertia_kgm2, self.late_s
+        much = max(min(break_away_Nm / inertia.value, MOST_radps2) - LITTLE_radps2, 0.0)
+        wider = {
+            "inertia_kgm2": replace(inertia, half=math.hypot(inertia.half, FRICTION_SHARE * much * inertia.value)),
+            "late_s": replace(late, half=math.hypot(late.half, FRICTION_LATE_s * much)),
+        }
+        return replace(self, values={**self.values, **wider})
 
     def to_dict(self) -> dict[str, Any]:
         return {

@@ -66,6 +66,7 @@ def response(
     """Frequency response by a multisine on a slow triangle in torque; inertias, resonance, stiffness, delay and lag."""
     import contextlib
 
+    from jointctl.tools.configuration.conversions import static_friction_Nm
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import TerminalConsent, require_terminal
@@ -97,6 +98,7 @@ def response(
     result, fit = found.to_dict(), None
     try:
         fit = fit_joint(found, config.joint.inertia_kgm2, configured_ratio(config))
+        fit = fit.beside_friction(static_friction_Nm(config) or 0.0)
         result["fit"] = fit.to_dict()
     finally:  # what was measured is kept where no model fits
         replace_file(file, json.dumps(result, indent=1).encode())

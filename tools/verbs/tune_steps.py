@@ -56,14 +56,16 @@ from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import (
+    ALONE,
+    LEAST_LEGS,
     Carrier,
     NotCarriedOut,
-    StoodStill,
     VERIFY_s,
-    measured_response,
     require_one_joint,
     require_same_joint,
+    response_by_any_law,
     response_task,
+    task_by,
     verifying_motion,
     with_motion,
 )
@@ -95,7 +97,6 @@ STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
-FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
@@ -258,27 +259,26 @@ class Tune:
     # --- 2. frequency response and the model that fits it ---
 
     def _step_response(self) -> dict[str, Any]:
-        config = self._before_friction()
-        task = response_task(config, None, AS_IT_FITS.legs)
-        try:
-            found, records, plan = measured_response(task, self.carrier)
-        except StoodStill:  # a law for an inertia that is too small turns the friction round too late
-            self.carrier.output.note("  it stood still: once more, with a part of its friction fed forward")
-            static_Nm = static_friction_Nm(config) or 0.0
-            fed_Nm = FED_SHARE * static_Nm
-            config = with_sliding(config, static_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
-            task = response_task(config, None, AS_IT_FITS.legs)
-            found, records, plan = measured_response(task, self.carrier)
+        law, task, (found, records, plan) = response_by_any_law(
+            self._before_friction(), self._break_away_Nm(), AS_IT_FITS.legs, self.carrier
+        )
+        config = task.config
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
         fit = fit_joint(found, config.joint.inertia_kgm2, configured_ratio(config))
+        fit = fit.beside_friction(self._break_away_Nm())
         require_one_joint(task, plan, records, fit)
-        return {**found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found}
+        return {
+            **found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found, "law": law,
+        }  # fmt: skip
+
+    def _break_away_Nm(self) -> float:
+        return max(finding["numbers"].get("break_away_Nm", 0.0) for finding in self.state["direction"])
 
     def _before_friction(self) -> Config:
         """A friction that may be wrong by any factor is no help: what is known is the torque that moved the joint."""
-        numbers = [finding["numbers"].get("break_away_Nm", 0.0) for finding in self.state["direction"]]
-        return with_break_away(self.config, max(numbers)) if max(numbers) > 0.0 else without_friction(self.config)
+        torque_Nm = self._break_away_Nm()
+        return with_break_away(self.config, torque_Nm) if torque_Nm > 0.0 else without_friction(self.config)
 
     def _sliding(self) -> Config:
         """With what the legs of the response say of the friction: at low speed a soft law sticks without it.
@@ -303,7 +303,9 @@ class Tune:
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
         )
         # for the motions that measure: at low speed a softer law sticks, and no plateau settles
-        self.config = self._with_control(self.chosen_gains(self.options.law, "tracking").control)
+        gains = self.chosen_gains(self.options.law, "tracking")
+        self._require(gains)
+        self.config = self._with_control(gains.control)
 
     def fitted(self) -> list[Found]:
         assert self.fit is not None
@@ -438,9 +440,10 @@ class Tune:
     def _require_same_joint(self, when: str) -> None:
         assert self.fit is not None
         assert self.response is not None
-        config = self._before_friction()
+        law = self.state["response"].get("law", ALONE)
+        task = task_by(law, self._before_friction(), self._break_away_Nm(), LEAST_LEGS)
         try:
-            require_same_joint(config, self.carrier, self.response.peak_Nm, self.fit, when)
+            require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
         except MarginError as error:  # the law of the response, on the joint that is known to be soft now
             self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 

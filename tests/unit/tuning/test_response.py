@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import DataError, UsageError
+from jointctl.drivers.errors import DataError, MotionFault, UsageError
 from jointctl.firmware_py.friction import friction_curve_Nm
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase, Encoders, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
 from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.configuration.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.tuning import carry_out
-from jointctl.tools.tuning.carry_out import response_task
+from jointctl.tools.tuning.carry_out import Carried, HUNTING_Hz, response_by_any_law, response_task
 from jointctl.tools.tuning.frequency_response import (
     Channel,
     FrequencyResponse,
@@ -43,7 +44,7 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.joint_fit import Estimate, fit_from_dict, fit_joint, fitted_again, gravity_of
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 T = 1e-3
 SOFT = TwoMasses(0.9, 1.3, 2.4e4, 15.0, (0.0, 0.0), (12.0, 0.0))
@@ -226,6 +227,15 @@ def test_two_masses_are_found_with_intervals_from_a_wrong_guess(seed: int) -> No
     assert again.response(frequency, "link") == pytest.approx(fit.response(frequency, "link"))
 
 
+def test_intervals_of_a_light_joint_with_much_friction_are_wider_and_others_stay() -> None:
+    fit = fit_joint(replace(made_response(RIGID, (1e-3, 5e-4)), link=None), 2.0)
+    little, much = fit.beside_friction(10.0), fit.beside_friction(2.1 * 200.0)
+    assert little == fit
+    assert much.inertia_kgm2.half == pytest.approx(0.36 * 2.1, rel=0.05)
+    assert much.late_s.half == pytest.approx(0.45e-3, rel=0.05)
+    assert much.delay_s == fit.delay_s
+
+
 @pytest.mark.parametrize("believed", [1.0, 1.3 / 0.9, 0.7])
 def test_an_encoder_on_the_link_alone_tells_inertia_and_resonance_and_leaves_the_share(believed: float) -> None:
     fit = fit_joint(replace(made_response(SOFT, (1.3e-3, 0.6e-3)), motor=None), 5.0, believed)
@@ -365,6 +375,50 @@ def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own() -> None
     weak = response_task(shipped("realistic"), None, AS_IT_FITS.legs).config  # the twin
     assert weak.control.kind == "computed_torque_observer"
     assert weak.control.kv == 20.0
+
+
+def test_a_light_joint_is_not_turned_round_by_its_excitation() -> None:
+    assert largest_peak_Nm(shipped("precise")) == pytest.approx(9.0)  # 15 % of the limit
+    assert largest_peak_Nm(shipped("precise", joint__inertia_kgm2=0.2)) == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize(
+    ("fault", "value", "torque_Nm", "weak"),
+    [
+        (Fault.LIMIT_CYCLE, 0.99 * HUNTING_Hz, 29.0, True),  # 1.5 times what moved it, without the excitation
+        (Fault.LIMIT_CYCLE, 1.01 * HUNTING_Hz, 29.0, False),  # a resonance: a stiffer law would feed it
+        (Fault.LIMIT_CYCLE, 0.99 * HUNTING_Hz, 35.0, False),  # against something
+        (Fault.FOLLOWING_ERROR, 0.1, 29.0, True),
+        (Fault.FOLLOWING_ERROR, 0.1, 35.0, False),
+        (Fault.POSITION_FROZEN, 0.05, 29.0, True),
+        (Fault.POSITION_FROZEN, 0.05, 31.0, False),
+        (Fault.STALE_SAMPLE, 0.1, 0.0, False),
+        (Fault.VELOCITY_LIMIT, 1.0, 0.0, False),
+    ],
+)
+def test_the_next_law_follows_on_one_that_is_too_weak_alone(
+    fault: Fault, value: float, torque_Nm: float, weak: bool
+) -> None:
+    laws: list[Any] = []
+
+    def run(config: Any, *_: Any, **__: Any) -> Carried:
+        laws.append((config.control.kp, config.control.feed_forward))
+        log = new(LogRecord, 100)
+        log.phase, log.command_torque_Nm = AxisPhase.TRACKING, torque_Nm
+        log.desired_position_rad = np.linspace(0.0, 0.05, len(log))
+        return Carried(log, fault, FaultText("happened", "cause", "next"), "", value)
+
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
+    before = with_break_away(shipped("precise"), 20.0)
+    with pytest.raises(MotionFault, match=fault.name):
+        response_by_any_law(before, 20.0, 8, carrier)
+    attempts = [(100.0, "none"), (100.0, "desired"), (1600.0, "desired")]
+    assert laws == (attempts if weak else attempts[:1])
+    laws.clear()
+    light = changed(before, joint__inertia_kgm2=0.5)
+    with pytest.raises(MotionFault, match=fault.name):
+        response_by_any_law(light, 20.0, 8, carrier)
+    assert laws == (attempts[:0:-1] if weak else attempts[2:])
 
 
 @pytest.mark.parametrize(("lost", "measured"), [(0, 1), (1, 2), (2, 2)])
