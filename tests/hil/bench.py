@@ -156,7 +156,9 @@ class Bench:
         network = self.network()
         try:
             network.send_message(0, [128, node])
-            return int.from_bytes(network.add_node(node).sdo.upload(0x6041, 0), "little")
+            remote = network.add_node(node)
+            remote.sdo.RESPONSE_TIMEOUT = 3.0  # the drive may wait for a processor that four files of tests share
+            return int.from_bytes(remote.sdo.upload(0x6041, 0), "little")
         finally:
             network.disconnect()
 

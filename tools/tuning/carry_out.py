@@ -286,7 +286,7 @@ def task_by(law: str, before: Config, break_away_Nm: float, legs: int) -> Respon
     if law != ALONE and break_away_Nm > 0.0:
         fed_Nm = FED_SHARE * break_away_Nm
         before = with_sliding(before, break_away_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
-    return response_task(before, None, legs, _LAWS[law])
+    return response_task(before, None, legs, _LAWS.get(law, WEAK))
 
 
 def response_by_any_law(

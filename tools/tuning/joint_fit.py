@@ -42,7 +42,7 @@ STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
 USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
-RATIO_SPREAD = 0.7  # of the logarithm of link over motor: the link's encoder alone sees their sum and the resonance
+SHARE_SPREAD = 0.7  # of the motor's logarithm, or of link over motor: the link alone shows their sum and the resonance
 LATEST_s = 0.012  # of delay and of lag, at most
 # by which a value is off besides, because sliding friction is not viscous, and hysteresis no spring: of
 # tests/bench/tune_ensemble.py
@@ -191,10 +191,10 @@ class _Model:
     The loss is that of hysteresis: as damping alone it would look like delay.
     """
 
-    def __init__(self, parts: list[_Data], period_s: float, flexible: bool, link_over_motor: float) -> None:
+    def __init__(self, parts: list[_Data], period_s: float, flexible: bool, motor_kgm2: float | None) -> None:
         self.parts, self.period_s, self.flexible = parts, period_s, flexible
         self.count = 2 * sum(len(part.sigma) for part in parts)
-        self.ratio = math.log(link_over_motor)
+        self.motor_kgm2 = motor_kgm2
         self.tells_link = not flexible or any(part.side == "motor" for part in parts)
 
     def joint(self, x: np.ndarray) -> TwoMasses:
@@ -215,7 +215,9 @@ class _Model:
         """Residuals of what is known beforehand of values that the data hardly tell."""
         rows = [(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD]
         if not self.tells_link:
-            rows.append((x[4] - self.ratio) / RATIO_SPREAD)
+            motor_kgm2 = self.joint(x).motor_kgm2
+            off = x[4] if self.motor_kgm2 is None else math.log(motor_kgm2 / self.motor_kgm2)
+            rows.append(off / SHARE_SPREAD)
         return np.array(rows)
 
     def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
@@ -255,25 +257,22 @@ class _Model:
         return np.array([*parts, x[3], delay, lag, delay + lag, self.loss(x)])
 
 
-def configured_ratio(config: Config) -> float:
-    """Inertia of the link over that of the motor, as the file has them; 1 where it has no reducer."""
-    if config.reducer is None:
-        return 1.0
-    motor = config.reducer.motor_inertia_kgm2
-    return (config.joint.inertia_kgm2 - motor) / motor
+def believed_motor_kgm2(config: Config) -> float | None:
+    """Of the file, if it knows a reducer."""
+    return None if config.reducer is None else config.reducer.motor_inertia_kgm2
 
 
-def fit_joint(found: FrequencyResponse, inertia_kgm2: float, link_over_motor: float = 1.0) -> JointFit:
+def fit_joint(found: FrequencyResponse, inertia_kgm2: float, motor_kgm2: float | None = None) -> JointFit:
     """The model that the data choose; `inertia_kgm2` is where the search begins.  `DataError` with too few lines.
 
-    The inertia of link over motor is believed to be about `link_over_motor` where only the link was measured, whose
-    response does not tell it.
+    Where only the link was measured, whose response does not tell it, the motor is believed to have about `motor_kgm2`,
+    or half of what is found.
     """
     parts = _used(found)
     begin = [math.log(inertia_kgm2), math.log(0.0015), math.log(0.0005), 5.0]
-    rigid = _Model(parts, found.period_s, False, link_over_motor)
+    rigid = _Model(parts, found.period_s, False, motor_kgm2)
     one = min((rigid.fitted([begin[0] + step, *begin[1:]]) for step in (-0.5, 0.5)), key=lambda fit: fit.cost)
-    soft = _Model(parts, found.period_s, True, link_over_motor)
+    soft = _Model(parts, found.period_s, True, motor_kgm2)
     inertia = float(np.clip(one.x[0], -3.0 + begin[0], 3.0 + begin[0]))
     starts = [
         [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE), LOSS]
@@ -298,7 +297,7 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float, link_over_motor: fl
 def fitted_again(found: FrequencyResponse, before: JointFit) -> Estimate:
     """The inertia by another response of a joint whose model is known: one search, which begins there."""
     joint = before.joint()
-    model = _Model(_used(found), found.period_s, before.flexible, joint.link_kgm2 / joint.motor_kgm2)
+    model = _Model(_used(found), found.period_s, before.flexible, joint.motor_kgm2)
     late = [math.log(max(before.values[name].value, 2e-5)) for name in ("delay_s", "lag_s")]
     start = [math.log(before.inertia_kgm2.value), *late, before.friction_Nmspr.value]
     if before.flexible:

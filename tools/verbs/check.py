@@ -273,8 +273,10 @@ def _table(analysis: LoopCheck) -> Table:
         oscillation = f"{found.oscillation_Hz:.2f} Hz, damping {found.oscillation_damping:.3f}"
         table.add_row("oscillation", oscillation, "pair of the sampled loop that decays slowest")
     table.add_section()
-    wanted = f"at least {analysis.min_phase_margin_deg:g} deg wanted (margin.min_phase_margin_deg)"
-    table.add_row("verdict", analysis.verdict, wanted)
+    wanted, keys = f"at least {analysis.min_phase_margin_deg:g} deg", "margin.min_phase_margin_deg"
+    if math.isfinite(analysis.settings.largest_s):
+        wanted, keys = f"{wanted}, |S| at most {analysis.settings.largest_s:g}", f"{keys}, max_sensitivity"
+    table.add_row("verdict", analysis.verdict, f"{wanted} wanted ({keys})")
     return table
 
 

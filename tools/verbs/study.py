@@ -102,6 +102,10 @@ def study(
     controllers, joint = study_controllers(settings), random_plant(base, settings.plant, settings.seed, 0)
     for controller in controllers:
         controller_config(joint, controller)  # a contradiction is to be reported before an hour of simulation
+    if settings.plant.flexible and settings.plant.choose_gains:
+        names = [one.name for one in controllers if one.control.kind == "flexible_joint"]
+        if names:
+            output.note(f"{', '.join(names)}: kp, kv and observer_radps are chosen for each joint (plant.choose_gains)")
     title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
     with output.progress(title, settings.plants) as advance:
         result = run_study(base, controllers, settings, workers=workers or HERE, progress=advance)

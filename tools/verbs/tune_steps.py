@@ -79,7 +79,7 @@ from jointctl.tools.tuning.gains import (
 )
 from jointctl.tools.tuning.joint_fit import (
     JointFit,
-    configured_ratio,
+    believed_motor_kgm2,
     fit_from_dict,
     fit_joint,
     gravity_of,
@@ -265,7 +265,7 @@ class Tune:
         config = task.config
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
-        fit = fit_joint(found, config.joint.inertia_kgm2, configured_ratio(config))
+        fit = fit_joint(found, config.joint.inertia_kgm2, believed_motor_kgm2(config))
         fit = fit.beside_friction(self._break_away_Nm())
         require_one_joint(task, plan, records, fit)
         return {
