@@ -251,19 +251,35 @@ def response_task(config: Config, torque_Nm: float | None, legs: int, law: Respo
 
 
 def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyResponse, Any, ResponsePlan]:
-    """All stages; (response, records, plan) of the last one.  Faults as `Carrier.run` has them."""
-    peak_Nm, before = LEAST_SHARE * task.largest_Nm, None
-    while peak_Nm < task.largest_Nm:
-        found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
-        carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
-        if before is not None:
-            _refuse_growth(before, found)
-        elif found.coherence >= GOOD_COHERENCE:
-            task = _better(task, found)
-        if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
-            break
-        peak_Nm, before = GROWTH * peak_Nm, found
-    found, records, plan = _stage(task, carrier, min(peak_Nm, task.largest_Nm), task.pairs)
+    """All stages; (response, records, plan) of the last one.  Faults as `Carrier.run` has them.
+
+    Where more torque is more than the law holds, the last one has that of the stage before.
+    """
+    peak_Nm, before, weighed = LEAST_SHARE * task.largest_Nm, None, False
+    try:
+        while peak_Nm < task.largest_Nm:
+            found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
+            carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
+            if before is not None:
+                _refuse_growth(before, found)
+            if found.coherence >= GOOD_COHERENCE and not weighed:
+                task, weighed = _better(task, found), True
+            if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
+                break
+            peak_Nm, before = GROWTH * peak_Nm, found
+        return _whole(task, carrier, min(peak_Nm, task.largest_Nm), before)
+    except TooWeak as error:
+        if before is None or before.coherence < GOOD_COHERENCE:
+            raise
+        carrier.output.note(f"  {error.message}: once more, with {before.peak_Nm:.2f} Nm")
+    return _whole(task, carrier, before.peak_Nm, None)
+
+
+def _whole(
+    task: ResponseTask, carrier: Carrier, peak_Nm: float, before: FrequencyResponse | None
+) -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    """Of all legs."""
+    found, records, plan = _stage(task, carrier, peak_Nm, task.pairs)
     carrier.output.note(f"  {found.peak_Nm:.2f} Nm: coherence {found.coherence:.3f}, {found.legs} legs")
     if before is not None:
         _refuse_growth(before, found)

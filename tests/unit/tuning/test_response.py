@@ -24,8 +24,16 @@ from jointctl.tools.configuration.found_values import with_break_away, with_slid
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.tuning import carry_out
-from jointctl.tools.tuning.carry_out import Carried, HUNTING_Hz, response_by_any_law, response_task
+from jointctl.tools.tuning.carry_out import (
+    Carried,
+    HUNTING_Hz,
+    TooWeak,
+    measured_response,
+    response_by_any_law,
+    response_task,
+)
 from jointctl.tools.tuning.frequency_response import (
+    GOOD_COHERENCE,
     Channel,
     FrequencyResponse,
     ResponsePlan,
@@ -420,6 +428,30 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     with pytest.raises(MotionFault, match=fault.name):
         response_by_any_law(light, 20.0, 8, carrier)
     assert laws == (attempts[:0:-1] if weak else attempts[2:])
+
+
+@pytest.mark.parametrize("coherence", [0.95, 0.85])
+def test_more_torque_than_the_law_holds_ends_with_that_of_the_stage_before(
+    monkeypatch: pytest.MonkeyPatch, coherence: float
+) -> None:
+    stages: list[tuple[float, int]] = []
+
+    def stage(_: Any, __: Any, peak_Nm: float, pairs: int) -> Any:
+        stages.append((peak_Nm, pairs))
+        if peak_Nm > 3.0:
+            raise TooWeak("it swings")
+        return SimpleNamespace(coherence=coherence, peak_Nm=peak_Nm, legs=2 * pairs), "records", "plan"
+
+    for name, fake in (("_stage", stage), ("_refuse_growth", lambda *_: None), ("_better", lambda task, _: task)):
+        monkeypatch.setattr(carry_out, name, fake)
+    said: list[str] = []
+    carrier: Any = SimpleNamespace(output=SimpleNamespace(note=said.append))
+    known = coherence > GOOD_COHERENCE
+    with nullcontext() if known else pytest.raises(TooWeak, match="it swings"):
+        found, *_ = measured_response(response_task(shipped("precise"), None, 12), carrier)
+        assert found.peak_Nm == pytest.approx(2.25)
+        assert "it swings: once more, with 2.25 Nm" in "".join(said)
+    assert stages == [(1.125, 2), (2.25, 2), (4.5, 2), (2.25, 6)][: 4 if known else 3]
 
 
 @pytest.mark.parametrize(("lost", "measured"), [(0, 1), (1, 2), (2, 2)])
