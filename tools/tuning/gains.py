@@ -96,10 +96,10 @@ class Law:
     spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
     kp_of_kv: float
 
-    encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
+    encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
 
     def beyond(self, settings: LoopSettings) -> float:
         """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
@@ -138,21 +138,20 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, None, QUICKEST_OBSERVER_radps,
-        USUAL_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
     ),
     "paper": Law(
         "paper", paper_control, ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
     "two_encoders": Law(
         "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, Encoders.BOTH, LARGEST_OBSERVER_radps,
-        most_noise_Nm=LARGEST_NOISE_Nm,
+        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.BOTH,
     ),
     "link_encoder": Law(
         "link_encoder", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
-        ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, Encoders.LINK, LARGEST_OBSERVER_radps,
-        most_noise_Nm=LARGEST_NOISE_Nm,
+        ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.LINK,
     ),
 }  # fmt: skip
 
@@ -327,13 +326,14 @@ class _Search:
         ]
         self._of_goals = len(joints)
         joints += [linear_loop(case).joint for case in cases(settings)]
-        large = steady_joints(config) + lossless_joints(config)
+        lossless = lossless_joints(config)
+        large = steady_joints(config) + lossless
         joints += [
             sampled_joint(period_s, settings.delay_s, settings.lag_s, joint, settings.encoders) for joint in large
         ]
         self._eased = np.ones(len(joints))
         if settings.encoders == Encoders.LINK:
-            self._eased[len(joints) - len(lossless_joints(config)) :] = EASED
+            self._eased[len(joints) - len(lossless) :] = EASED
         self._responses = np.array([joint.response(self._z) for joint in joints])
         plants = [joint.state_space() for joint in joints]
         sizes = [len(plant.a) for plant in plants]  # by their delay

@@ -257,9 +257,10 @@ class _Model:
         return np.array([*parts, x[3], delay, lag, delay + lag, self.loss(x)])
 
 
-def believed_motor_kgm2(config: Config) -> float | None:
-    """Of the file, if it knows a reducer."""
-    return None if config.reducer is None else config.reducer.motor_inertia_kgm2
+def fit_of(found: FrequencyResponse, config: Config, break_away_Nm: float) -> JointFit:
+    """`fit_joint` with what the file believes in, and the intervals that its friction leaves."""
+    motor_kgm2 = None if config.reducer is None else config.reducer.motor_inertia_kgm2
+    return fit_joint(found, config.joint.inertia_kgm2, motor_kgm2).beside_friction(break_away_Nm)
 
 
 def fit_joint(found: FrequencyResponse, inertia_kgm2: float, motor_kgm2: float | None = None) -> JointFit:

@@ -73,7 +73,7 @@ def response(
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, measured_response, response_task
     from jointctl.tools.tuning.frequency_response import bode_figure
-    from jointctl.tools.tuning.joint_fit import believed_motor_kgm2, fit_joint
+    from jointctl.tools.tuning.joint_fit import fit_of
     from jointctl.tools.written_file import replace_file, require_target
 
     picture, file = figure or Path(f"{config.path.stem}.response.png"), out or Path(f"{config.path.stem}.response.json")
@@ -97,8 +97,7 @@ def response(
             return never_begun(ended.drive_state, output, dry_run=dry_run)
     result, fit = found.to_dict(), None
     try:
-        fit = fit_joint(found, config.joint.inertia_kgm2, believed_motor_kgm2(config))
-        fit = fit.beside_friction(static_friction_Nm(config) or 0.0)
+        fit = fit_of(found, config, static_friction_Nm(config) or 0.0)
         result["fit"] = fit.to_dict()
     finally:  # what was measured is kept where no model fits
         replace_file(file, json.dumps(result, indent=1).encode())

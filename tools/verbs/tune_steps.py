@@ -79,9 +79,8 @@ from jointctl.tools.tuning.gains import (
 )
 from jointctl.tools.tuning.joint_fit import (
     JointFit,
-    believed_motor_kgm2,
     fit_from_dict,
-    fit_joint,
+    fit_of,
     gravity_of,
     values_of_fit,
 )
@@ -265,8 +264,7 @@ class Tune:
         config = task.config
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
-        fit = fit_joint(found, config.joint.inertia_kgm2, believed_motor_kgm2(config))
-        fit = fit.beside_friction(self._break_away_Nm())
+        fit = fit_of(found, config, self._break_away_Nm())
         require_one_joint(task, plan, records, fit)
         return {
             **found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found, "law": law,
