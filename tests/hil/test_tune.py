@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,10 @@ from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written
 
 IN_LOCKSTEP = ResponseOptions(lockstep=True)
+LIGHT: dict[str, Any] = {  # 0.3 kg m^2 that break away at 10 Nm
+    "joint__inertia_kgm2": 0.375, "virtual__inertia_scale": 0.8, "virtual__friction_positive_scale": 0.55,
+    "virtual__friction_negative_scale": 0.5,
+}  # fmt: skip
 
 
 def outputs(*, json_too: bool = True) -> tuple[Output, io.StringIO, io.StringIO]:
@@ -98,11 +103,8 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
 
 
 def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_response(tmp_path: Path) -> None:
-    """0.3 kg m^2 that break away at 10 Nm: a weak law swung or stood, and 9 Nm would turn it round."""
-    path = written(
-        tmp_path / "light.toml", "precise", joint__inertia_kgm2=0.375, virtual__inertia_scale=0.8,
-        virtual__friction_positive_scale=0.55, virtual__friction_negative_scale=0.5,
-    )  # fmt: skip
+    """A weak law swung or stood, and 9 Nm would turn it round."""
+    path = written(tmp_path / "light.toml", "precise", **LIGHT)
     before = load_config(path)
     output, out, _ = outputs()
     assert tune(before, output, options=TuneOptions(lockstep=True)) == 0
@@ -110,6 +112,19 @@ def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_
     assert found["response"]["law"] == FED_STIFF
     assert tuned.joint.inertia_kgm2 == pytest.approx(0.3, rel=0.08)
     assert found["verification"]["after"]["rmse_mrad"] < 0.2
+
+
+def test_a_response_alone_of_a_light_joint_has_the_law_of_a_tune(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The friction of its configuration tells; a weak law stood still."""
+    monkeypatch.chdir(tmp_path)
+    output, out, _ = outputs()
+    config = load_config(written(tmp_path / "light.toml", "precise", **LIGHT))
+    assert response(config, output, options=IN_LOCKSTEP) == 0
+    found = json.loads(out.getvalue())["fit"]["values"]["inertia_kgm2"]
+    assert found["value"] == pytest.approx(0.3, abs=found["half"])
+    assert found["half"] < 0.1
 
 
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:

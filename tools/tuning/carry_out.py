@@ -7,7 +7,6 @@ simulated time as well.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import static_friction_Nm
 from jointctl.tools.configuration.found_values import Found, rounded, with_sliding, with_values
 from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
 from jointctl.tools.configuration.sections import MinJerk, Trajectory
@@ -297,28 +297,36 @@ MUCH_FRICTION_radps2 = 25.0  # torque to break away over the inertia that is bel
 FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
 
 
-def task_by(law: str, before: Config, break_away_Nm: float, legs: int) -> ResponseTask:
-    """By one of these laws; `before`: the configuration without a friction that is fed forward."""
-    if law != ALONE and break_away_Nm > 0.0:
-        fed_Nm = FED_SHARE * break_away_Nm
-        before = with_sliding(before, break_away_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
-    return response_task(before, None, legs, _LAWS.get(law, WEAK))
+def task_by(law: str, before: Config, legs: int, torque_Nm: float | None = None) -> ResponseTask:
+    """By one of these laws; a friction of `before` that is not fed forward is known at standstill alone."""
+    static_Nm = static_friction_Nm(before) or 0.0
+    if law != ALONE and static_Nm > 0.0 and before.control.feed_forward == "none":
+        fed_Nm = FED_SHARE * static_Nm
+        before = with_sliding(before, static_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
+    return response_task(before, torque_Nm, legs, _LAWS.get(law, WEAK))
 
 
 def response_by_any_law(
-    before: Config, break_away_Nm: float, legs: int, carrier: Carrier
+    before: Config, legs: int, carrier: Carrier, torque_Nm: float | None = None
 ) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
     """(law, its task, what it measured), with the next law where one is too weak; faults as `measured_response`."""
-    much = break_away_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
-    laws = _MUCH_FRICTION if much else _LITTLE_FRICTION
-    for law, after in itertools.pairwise(laws):
-        task = task_by(law, before, break_away_Nm, legs)
+    static_Nm = static_friction_Nm(before) or 0.0
+    much = static_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
+    laws: tuple[str, ...] = _MUCH_FRICTION if much else _LITTLE_FRICTION
+    if static_Nm == 0.0 or before.control.feed_forward != "none":  # the weak law has it already, or there is none
+        laws = tuple(law for law in laws if law != FED)
+
+    def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
+        task = task_by(law, before, legs, torque_Nm)
         try:
             return law, task, measured_response(task, carrier)
         except TooWeak as error:
-            carrier.output.note(f"  {error.message}: once more, {after}")
-    task = task_by(laws[-1], before, break_away_Nm, legs)
-    return laws[-1], task, measured_response(task, carrier)
+            if not others:
+                raise
+            carrier.output.note(f"  {error.message}: once more, {others[0]}")
+        return by(*others)
+
+    return by(*laws)
 
 
 def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarray, fit: JointFit) -> None:

@@ -71,7 +71,7 @@ def response(
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import TerminalConsent, require_terminal
     from jointctl.tools.session.result import never_begun, require_off
-    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, measured_response, response_task
+    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, response_by_any_law, response_task
     from jointctl.tools.tuning.frequency_response import bode_figure
     from jointctl.tools.tuning.joint_fit import fit_of
     from jointctl.tools.written_file import replace_file, require_target
@@ -88,7 +88,8 @@ def response(
     with contextlib.ExitStack() as stack:
         control = None if options.lockstep else stack.enter_context(in_control(task.config, output))
         try:
-            found, *_ = measured_response(task, Carrier(output, consent, control, allow_low_margin))
+            carrier = Carrier(output, consent, control, allow_low_margin)
+            found = response_by_any_law(config, options.legs, carrier, options.torque_Nm)[-1][0]
         except NotCarriedOut as ended:
             if ended.stopped_by:
                 output.note(f"stopped by {ended.stopped_by}; no response")

@@ -258,9 +258,7 @@ class Tune:
     # --- 2. frequency response and the model that fits it ---
 
     def _step_response(self) -> dict[str, Any]:
-        law, task, (found, records, plan) = response_by_any_law(
-            self._before_friction(), self._break_away_Nm(), AS_IT_FITS.legs, self.carrier
-        )
+        law, task, (found, records, plan) = response_by_any_law(self._before_friction(), AS_IT_FITS.legs, self.carrier)
         config = task.config
         tracked = records[records.phase == AxisPhase.TRACKING]
         gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
@@ -439,7 +437,7 @@ class Tune:
         assert self.fit is not None
         assert self.response is not None
         law = self.state["response"].get("law", ALONE)
-        task = task_by(law, self._before_friction(), self._break_away_Nm(), LEAST_LEGS)
+        task = task_by(law, self._before_friction(), LEAST_LEGS)
         try:
             require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
         except MarginError as error:  # the law of the response, on the joint that is known to be soft now

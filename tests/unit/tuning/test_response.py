@@ -420,13 +420,13 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     before = with_break_away(shipped("precise"), 20.0)
     with pytest.raises(MotionFault, match=fault.name):
-        response_by_any_law(before, 20.0, 8, carrier)
+        response_by_any_law(before, 8, carrier)
     attempts = [(100.0, "none"), (100.0, "desired"), (1600.0, "desired")]
     assert laws == (attempts if weak else attempts[:1])
     laws.clear()
     light = changed(before, joint__inertia_kgm2=0.5)
     with pytest.raises(MotionFault, match=fault.name):
-        response_by_any_law(light, 20.0, 8, carrier)
+        response_by_any_law(light, 8, carrier)
     assert laws == (attempts[:0:-1] if weak else attempts[2:])
 
 
