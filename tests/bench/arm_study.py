@@ -23,7 +23,7 @@ import numpy as np
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
 from jointctl.tools.analysis.arm_check import joint_loop, pose_ranges
-from jointctl.tools.analysis.flexible_gains import chosen_gains
+from jointctl.tools.analysis.gains import gains_of_file
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
@@ -111,7 +111,7 @@ def with_reducer(arm: ArmConfig, number: int, ensemble: EnsembleSettings, seed: 
         "virtual": drawn.virtual.model_copy(update=true),
     })  # fmt: skip
     poses = joint_loop(arm.names[number], believed, pose_ranges(arm)[number])
-    gains = chosen_gains(poses.config, poses.settings)
+    gains = gains_of_file(poses.config, poses.settings)
     return believed.model_copy(update={"control": control.model_copy(update=gains.changes())})
 
 

@@ -27,6 +27,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+from jointctl.tools.analysis.gains import converging  # noqa: E402
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import largest_sensitivity, learning_convergence  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
@@ -49,7 +50,6 @@ from jointctl.tools.experiments.scenarios import (  # noqa: E402
     run_scenario,
 )
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
-from jointctl.tools.tuning.gains import converging  # noqa: E402
 
 AFTER_s = 75.0
 LEARNING = {"gain": 0.6, "error_gain_ps2": 300.0, "lead_cycles": 10, "half_width_cycles": 10}

@@ -43,6 +43,7 @@ sys.path.insert(0, str(ROOT))
 from jointctl.drivers.errors import JointctlError  # noqa: E402
 from jointctl.firmware_py.states import Encoders  # noqa: E402
 from jointctl.hil.lockstep import TRUE_POSITION_rad  # noqa: E402
+from jointctl.tools.analysis.gains import choose_gains  # noqa: E402
 from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
@@ -59,7 +60,6 @@ from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
 from jointctl.tools.tuning import carry_out  # noqa: E402
 from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
 from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402
-from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
 from jointctl.tools.tuning.joint_fit import SMALL_MOTION, Estimate, JointFit, values_of_fit  # noqa: E402
 from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
@@ -318,7 +318,7 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     assert plant.friction is not None
     friction = scaled(plant.friction, virtual.friction_positive_scale, virtual.friction_negative_scale)
     known = known.model_copy(update={"friction": friction})
-    best = choose_gains(known, truth, row["law"])
+    best = choose_gains(known, truth.intervals(), row["law"])
     row["rmse_true_mrad"], row["late_rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
     if motions:
         control = job.config.control.model_copy(update={"learning": None, "adaptation": None})

@@ -35,6 +35,7 @@ from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written
 
 IN_LOCKSTEP = ResponseOptions(lockstep=True)
+STIFF: dict[str, Any] = {"virtual__reducer_knees_Nm": (), "virtual__reducer_stiffness_beyond_Nmprad": ()}
 LIGHT: dict[str, Any] = {  # 0.3 kg m^2 that break away at 10 Nm
     "joint__inertia_kgm2": 0.375, "virtual__inertia_scale": 0.8, "virtual__friction_positive_scale": 0.55,
     "virtual__friction_negative_scale": 0.5,
@@ -228,21 +229,27 @@ def test_gains_that_measure_better_bring_their_own_margins(wrong: Path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "words"),
+    ("name", "changes", "error", "words"),
     [
         # as stuck as a joint with its brake closed
-        ({"virtual__friction_positive_scale": 9.0, "virtual__friction_negative_scale": 9.0}, MotionFault,
+        ("precise", {"virtual__friction_positive_scale": 9.0, "virtual__friction_negative_scale": 9.0}, MotionFault,
          r"direction: the reading of \[encoder\] stood still .* at up to 60.0 Nm"),
-        ({"virtual__friction_positive_scale": 2.2, "virtual__friction_negative_scale": 2.2}, MotionFault,
+        ("precise", {"virtual__friction_positive_scale": 2.2, "virtual__friction_negative_scale": 2.2}, MotionFault,
          r"friction: TORQUE_SATURATED .* 34 points are in .*friction.csv"),
-        ({"virtual__end_stops": True, "virtual__end_stop_min_rad": -0.3, "virtual__end_stop_max_rad": 0.3}, MotionFault,
+        ("precise",
+         {"virtual__end_stops": True, "virtual__end_stop_min_rad": -0.3, "virtual__end_stop_max_rad": 0.3}, MotionFault,
          r"response: .*(FOLLOWING_ERROR|TORQUE_SATURATED|POSITION_FROZEN|LIMIT_CYCLE)"),
+        # a reducer that is 100 times as stiff as [reducer] says, and one of 12 times that
+        ("realistic", {**STIFF, "virtual__reducer_stiffness_Nmprad": 1.6e6}, ConfigurationError,
+         r"response: .*: \[reducer\] has a resonance at 36 Hz, and the response shows none; .*correct \[reducer\]"),
+        ("realistic", {**STIFF, "virtual__reducer_stiffness_Nmprad": 2e5}, ConfigurationError,
+         r"response: .*: reducer.loop_stiffness_Nmprad \(=\d+\) must be at most 310000, .*correct \[reducer\]"),
     ],
 )  # fmt: skip
 def test_a_joint_that_does_not_move_as_it_should_ends_it_in_one_line(
-    tmp_path: Path, changes: dict[str, object], error: type[JointctlError], words: str
+    tmp_path: Path, name: str, changes: dict[str, object], error: type[JointctlError], words: str
 ) -> None:
-    path = written(tmp_path / "joint.toml", "precise", **changes)
+    path = written(tmp_path / "joint.toml", name, **changes)
     text = path.read_text()
     output, *_ = outputs()
     with pytest.raises(error, match=words) as raised:

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import CommandKind
-from jointctl.tools.analysis.flexible_gains import chosen_gains
+from jointctl.tools.analysis.gains import gains_of_file
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
@@ -133,12 +133,10 @@ def controller_config(base: Config, controller: Controller) -> Config:
 
 
 def with_chosen_gains(base: Config, controller: Controller) -> Controller:
-    """The law of a flexible joint with gains for what is believed of the base joint."""
+    """The law with gains for what is believed of the base joint."""
     config = controller_config(base, controller)
-    gains = chosen_gains(config, loop_settings(config)[0])
-    return Controller(
-        controller.name, changed(controller.control, gains.changes(), controller.name), controller.friction
-    )
+    changes = gains_of_file(config, loop_settings(config)[0]).changes()
+    return Controller(controller.name, changed(controller.control, changes, controller.name), controller.friction)
 
 
 def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:

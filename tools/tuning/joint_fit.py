@@ -18,6 +18,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 
 from jointctl.drivers.errors import DataError
+from jointctl.tools.analysis.gains import Intervals
 from jointctl.tools.analysis.linear_loop import TwoMasses
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.found_values import Found, rounded
@@ -105,6 +106,17 @@ class JointFit:
             joint = replace(joint, damping_Nmspr=joint.damping_Nmspr - lost)
         late = (self.delay_s.value, self.lag_s.value)
         return _response(joint, loss, *late, self.period_s, frequency_Hz)[side if self.flexible else "motor"]
+
+    def intervals(self) -> Intervals:
+        """As the choice of gains takes them."""
+
+        def share(name: str) -> float:
+            return self.values[name].half / self.values[name].value
+
+        if not self.flexible:
+            return Intervals(share("inertia_kgm2"), self.late_s.half)
+        stiffness = share("stiffness_Nmprad") if self.tells_link else 2.0 * share("resonance_Hz")
+        return Intervals(share("inertia_kgm2"), self.late_s.half, stiffness, share("link_kgm2"), self.tells_link)
 
     def beside_friction(self, break_away_Nm: float) -> JointFit:
         """Wider intervals where the friction is much for the inertia: where it slides it looks like a part of it."""

@@ -33,7 +33,7 @@ def check(
     *,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
     allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
-    choose_gains: Annotated[bool, typer.Option("--choose-gains", help="search gains for a flexible joint")] = False,
+    choose_gains: Annotated[bool, typer.Option("--choose-gains", help="search gains for the law of the file")] = False,
 ) -> int:
     """Is the control loop stable enough?  Margins, bounds and what would help; of an arm each joint over its poses."""
     from jointctl.tools.configuration.arm import ArmConfig
@@ -206,21 +206,23 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
 
 
 def _add_gains(table: Table, config: Config, settings: LoopSettings) -> dict[str, Any]:
-    """What would suit the joint that [reducer] describes, and what the gate makes of it; returns that for --json."""
-    from jointctl.tools.analysis.flexible_gains import chosen_gains
+    """What would suit the joint that the file describes, and what the gate makes of it; returns that for --json."""
+    from jointctl.tools.analysis.gains import gains_of_file
     from jointctl.tools.analysis.margin_gate import meets
     from jointctl.tools.analysis.margins import margins
 
-    gains = chosen_gains(config, settings)
-    found = margins(gains.loop(settings))
-    met = gains.met and meets(found, config.margin.min_phase_margin_deg)
+    chosen = gains_of_file(config, settings)
+    gains, found = chosen.best, margins(chosen.best.settings)
+    met, changes = not chosen.missed and meets(found, config.margin.min_phase_margin_deg), chosen.changes()
     note = f"phase margin {found.phase_margin_deg:.1f} deg, " if found.stable else "UNSTABLE, "
-    note += f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
+    largest_s = max(gains.sensitivity, gains.gate_sensitivity)
+    note += f"largest |S| {largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
     note += "" if met else ": NOT what is asked for, there are no such gains; less delay, or the other encoder too"
-    table.add_row("chosen gains", ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items()), note)
+    words = (f"{name} = {value[0] if isinstance(value, tuple) else value:g}" for name, value in changes.items())
+    table.add_row("chosen gains", ", ".join(words), note)
     return {
-        "changes": gains.changes(), "met": met, "phase_margin_deg": found.phase_margin_deg,
-        "largest_s": gains.largest_s, "noise_Nm": gains.noise_Nm,
+        "changes": changes, "met": met, "phase_margin_deg": found.phase_margin_deg, "largest_s": largest_s,
+        "noise_Nm": gains.noise_Nm,
     }  # fmt: skip
 
 

@@ -105,7 +105,7 @@ def study(
     if settings.plant.flexible and settings.plant.choose_gains:
         names = [one.name for one in controllers if one.control.kind == "flexible_joint"]
         if names:
-            output.note(f"{', '.join(names)}: kp, kv and observer_radps are chosen for each joint (plant.choose_gains)")
+            output.note(f"{', '.join(names)}: gains and filters are chosen for each joint (plant.choose_gains)")
     title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
     with output.progress(title, settings.plants) as advance:
         result = run_study(base, controllers, settings, workers=workers or HERE, progress=advance)

@@ -7,19 +7,22 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.gains import ChosenGains, PHASE_MARGIN_deg
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import map_figure
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.found_values import Found, rounded
+from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.tuning.frequency_response import bode_figure
-from jointctl.tools.tuning.gains import trade_off_figure
 from jointctl.tools.verbs.response import fit_table
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from jointctl.tools.verbs.tune_steps import Tune
 
 GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz")  # that are shown
@@ -151,3 +154,28 @@ def _margins_or_none(config: Config) -> Margins | None:
         return margins(loop_settings(config)[0])
     except ConfigurationError:
         return None
+
+
+def trade_off_figure(found: ChosenGains, title: str) -> Figure:
+    """Error against phase margin of everything that was tried; what keeps the margins is blue."""
+    stable = [one for one in found.tried if one.stable]
+    with canvas(4.2, title) as figure:
+        axis = figure.subplots()
+        for colour, label, chosen in (
+            (GREY, "misses a goal", [one for one in stable if not found.allows(one)]),
+            (BLUE, "meets all goals", [one for one in stable if found.allows(one)]),
+            (ORANGE, "chosen", [found.best]),
+        ):
+            size = 60 if label == "chosen" else 10
+            axis.scatter(
+                [one.phase_margin_deg for one in chosen], [one.error / found.best.error for one in chosen], s=size,
+                color=colour, label=label, zorder=3 if label == "chosen" else 2,
+            )  # fmt: skip
+        axis.axvline(PHASE_MARGIN_deg, color=RED, linewidth=0.8)
+        axis.set_yscale("log")
+        axis.set_ylim(0.3, 30.0)
+        axis.set_xmargin(0.03)
+        axis.set_xlabel("phase margin of the worst joint in the intervals [deg]")
+        axis.set_ylabel("modelled error / that of the chosen point")
+        axis.legend()
+        return figure

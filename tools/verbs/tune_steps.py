@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import (
+    ConfigurationError,
     DataError,
     JointctlError,
     LimitCycle,
@@ -27,9 +28,17 @@ from jointctl.drivers.errors import (
 )
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.gains import (
+    ChosenGains,
+    apart,
+    choose_gains,
+    require_encoders,
+    with_slow_observer,
+)
+from jointctl.tools.analysis.linear_loop import loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map
+from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
 from jointctl.tools.configuration.found_values import (
@@ -70,13 +79,6 @@ from jointctl.tools.tuning.carry_out import (
     with_motion,
 )
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
-from jointctl.tools.tuning.gains import (
-    ChosenGains,
-    apart,
-    choose_gains,
-    require_encoders,
-    with_slow_observer,
-)
 from jointctl.tools.tuning.joint_fit import (
     JointFit,
     fit_from_dict,
@@ -284,7 +286,7 @@ class Tune:
         config = self._before_friction()
         if self.fit is None:
             return config
-        config = with_slow_observer(config, self.fit, SWEEP_OBSERVER_radps)
+        config = with_slow_observer(config, self.fit.intervals(), SWEEP_OBSERVER_radps)
         static_Nm, kept = static_friction_Nm(config), self.state["response"]["gravity"]
         if static_Nm is None or "sliding_Nm" not in kept:
             return config
@@ -298,10 +300,20 @@ class Tune:
             f"  {'two masses' if self.fit.flexible else 'rigid'}, {self.fit.inertia_kgm2.value:.4g} kg m^2, "
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
         )
+        self._require_reducer()
         # for the motions that measure: at low speed a softer law sticks, and no plateau settles
         gains = self.chosen_gains(self.options.law, "tracking")
         self._require(gains)
         self.config = self._with_control(gains.control)
+
+    def _require_reducer(self) -> None:
+        """`ConfigurationError` where [reducer] is of another joint than what answered, whatever came later."""
+        reducer, problems = self.original.reducer, problems_between_sections(self.config)
+        if self.fit is not None and not self.fit.flexible and reducer is not None:
+            resonance_Hz = two_masses(self.original, reducer, 1.0, 1.0, False).resonance_Hz
+            problems = [f"[reducer] has a resonance at {resonance_Hz:.0f} Hz, and the response shows none"]
+        if problems:
+            raise ConfigurationError(f"{self.original.path}: {problems[0]}", "correct [reducer], or take it out")
 
     def fitted(self) -> list[Found]:
         assert self.fit is not None
@@ -319,7 +331,7 @@ class Tune:
 
     def chosen_gains(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
-        return choose_gains(self.config, self.fit, law, objective)
+        return choose_gains(self.config, self.fit.intervals(), law, objective)
 
     # --- 3. gravity, of the same motion ---
 
@@ -447,7 +459,7 @@ class Tune:
     def _kept(gains: ChosenGains) -> dict[str, Any]:
         best = gains.best
         return {
-            "law": gains.law, "control": gains.control.model_dump(mode="json", exclude_none=True),
+            "law": gains.law.name, "control": gains.control.model_dump(mode="json", exclude_none=True),
             "missed": gains.missed, "phase_margin_deg": best.phase_margin_deg, "gain_margin": best.gain_margin,
             "sensitivity": best.sensitivity, "noise_Nm": best.noise_Nm,
         }  # fmt: skip

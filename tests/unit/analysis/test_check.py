@@ -399,22 +399,29 @@ def test_learning_is_judged_with_the_worst_joint() -> None:
         assert (found.worst_factor < 1.0) is converges
 
 
-def test_gains_are_chosen_on_request_for_the_law_of_a_flexible_joint_only() -> None:
+def test_gains_are_chosen_on_request_for_the_law_of_the_file() -> None:
     shown, _, code = run_check(shipped("realistic"), choose_gains=True)
     assert code == 0
-    assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, observer_radps = [\d.]+ ", shown)
+    assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, observer_radps = [\d.]+, ", shown)
     shown, _, code = run_check(shipped("realistic", joint_encoder=None, encoder__side="joint"), choose_gains=True)
-    assert re.search(r"chosen gains .* velocity_cutoff_Hz = [\d.]+ ", shown)  # the resonance lies between
+    assert re.search(r"velocity_cutoff_Hz = \d\.\d+ ", shown)  # the resonance lies between
     chosen = json.loads(run_check(shipped("realistic"), choose_gains=True, json=True)[0])["chosen_gains"]
     assert chosen["met"] is True
-    assert set(chosen["changes"]) == {"kp", "kv", "observer_radps"}
+    keys = {"kp", "kv", "observer_radps", "observer_delay_cycles", "velocity_cutoff_Hz"}
+    assert set(chosen["changes"]) == {*keys, "link_cutoff_Hz"}
     assert chosen["phase_margin_deg"] > 30.0
     impossible = shipped("realistic", margin__min_phase_margin_deg=80.0)
     shown, _, code = run_check(impossible, choose_gains=True)
     assert (code, "NOT what is asked for" in shown) == (9, True)
-    for other in (shipped("virtual"), rigid_law_behind_a_reducer("encoder")):
-        with pytest.raises(ConfigurationError, match=r'gains are chosen for control.kind = "flexible_joint" .* only'):
-            run_check(other, choose_gains=True)
+    shown, _, code = run_check(shipped("paper"), choose_gains=True)
+    assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, lyapunov_q = [\d.]+ ", shown)
+    for config in (shipped("precise"), rigid_law_behind_a_reducer("encoder")):
+        chosen = json.loads(run_check(config, choose_gains=True, json=True)[0])["chosen_gains"]
+        assert set(chosen["changes"]) == keys
+        assert chosen["met"] is True
+    other = shipped("paper", control__kind="computed_torque")
+    with pytest.raises(ConfigurationError, match=r"gains are chosen for control.kind \(=computed_torque\) of flexible"):
+        run_check(other, choose_gains=True)
 
 
 KALMAN = {"control__velocity_filter": "kalman", "control__velocity_cutoff_Hz": 60.0}

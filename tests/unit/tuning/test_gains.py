@@ -9,21 +9,22 @@ import pytest
 import tomlkit
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings
-from jointctl.tools.analysis.margins import learning_convergence, margins
-from jointctl.tools.configuration.config import Config, Learning
-from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
-from jointctl.tools.tuning.gains import (
+from jointctl.tools.analysis.gains import (
     SENSITIVITY,
+    Intervals,
     LEAST_LATE_s,
     PHASE_MARGIN_deg,
     choose_gains,
     converging,
-    identified_joints,
+    joints_within,
     lossless_joints,
     steady_joints,
     with_slow_observer,
 )
+from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings
+from jointctl.tools.analysis.margins import learning_convergence, margins
+from jointctl.tools.configuration.config import Config, Learning
+from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
@@ -48,7 +49,7 @@ def known(config: Config, fit: JointFit) -> Config:
 def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> None:
     fit = fit_of(2.0, late_s)
     config = known(shipped("precise"), fit)
-    found = choose_gains(config, fit, law)
+    found = choose_gains(config, fit.intervals(), law)
     assert found.missed == {}
     settings, _ = loop_settings(changed(config, control=found.control))
     for factor in (0.97, 1.0, 1.03):  # a heavier joint is a smaller gain
@@ -63,14 +64,19 @@ def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> N
 
 def test_friction_without_bristles_adapts_to_nothing() -> None:
     fit = fit_of(2.0, 1.5e-3)
-    assert choose_gains(known(shipped("precise", friction__lugre=None), fit), fit, "precise").control.adaptation is None
+    assert (
+        choose_gains(
+            known(shipped("precise", friction__lugre=None), fit), fit.intervals(), "precise"
+        ).control.adaptation
+        is None
+    )
 
 
 def test_more_delay_leaves_less_and_a_quiet_loop_is_quieter() -> None:
     errors, noises = [], []
     for late_s, objective in ((1.5e-3, "tracking"), (3e-3, "tracking"), (1.5e-3, "quiet")):
         fit = fit_of(2.0, late_s)
-        best = choose_gains(known(shipped("precise"), fit), fit, "precise", objective).best
+        best = choose_gains(known(shipped("precise"), fit), fit.intervals(), "precise", objective).best
         errors.append(best.error)
         noises.append(best.noise_Nm)
     assert errors[1] > 1.5 * errors[0]
@@ -81,8 +87,8 @@ def test_more_delay_leaves_less_and_a_quiet_loop_is_quieter() -> None:
 def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> None:
     fit = fit_of(2.1, 1.8e-3, 1.1, 2.6e4)
     config = known(shipped("realistic"), fit)
-    found = choose_gains(config, fit)
-    assert found.law == "two_encoders"
+    found = choose_gains(config, fit.intervals())
+    assert found.law.name == "two_encoders"
     assert found.control.kind == "flexible_joint"
     judged = margins(loop_settings(changed(config, control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
@@ -94,8 +100,8 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
 def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_resonance() -> None:
     fit = replace(fit_of(2.1, 1.8e-3, 1.1, 2.6e4), tells_link=False)
     config = known(shipped("realistic", joint_encoder=None, encoder__side="joint"), fit)
-    found = choose_gains(config, fit)
-    assert (found.law, found.control.kind, found.missed) == ("link_encoder", "flexible_joint", {})
+    found = choose_gains(config, fit.intervals())
+    assert (found.law.name, found.control.kind, found.missed) == ("link_encoder", "flexible_joint", {})
     assert found.control.velocity_cutoff_Hz < 0.5 * fit.resonance_Hz.value
     settings, _ = loop_settings(changed(config, control=found.control))
     assert margins(settings).phase_margin_deg >= config.margin.min_phase_margin_deg
@@ -107,7 +113,9 @@ def test_a_share_that_was_not_seen_may_be_any_and_leaves_the_resonance() -> None
     fit = replace(fit_of(2.1, 1.8e-3, 1.1, 2.6e4), tells_link=False)
     estimates = {**fit.values, "link_kgm2": Estimate(1.1, 0.5), "resonance_Hz": Estimate(fit.resonance_Hz.value, 0.0)}
     config = known(shipped("realistic", margin__payload_range=(1.0, 1.0)), fit)
-    joints = [one for one in identified_joints(config, replace(fit, values=estimates)) if isinstance(one, TwoMasses)]
+    joints = [
+        one for one in joints_within(config, replace(fit, values=estimates).intervals()) if isinstance(one, TwoMasses)
+    ]
     assert [min(one.link_kgm2 for one in joints), max(one.link_kgm2 for one in joints)] == pytest.approx([0.6, 1.6])
     unseen = [one for one in joints if one.link_kgm2 != pytest.approx(1.1)]
     assert [one.motor_kgm2 + one.link_kgm2 for one in unseen] == pytest.approx([2.1] * 4)
@@ -117,14 +125,14 @@ def test_a_share_that_was_not_seen_may_be_any_and_leaves_the_resonance() -> None
 def test_the_slower_observer_of_a_soft_joint_passes_the_gate_where_it_is_later_than_was_found() -> None:
     fit = fit_of(2.1, 1.8e-3, 1.1, 2.6e4)
     config = known(shipped("realistic"), fit)
-    config = changed(config, control=choose_gains(config, fit).control)
-    slower = with_slow_observer(config, fit, 20.0)
+    config = changed(config, control=choose_gains(config, fit.intervals()).control)
+    slower = with_slow_observer(config, fit.intervals(), 20.0)
     assert 20.0 < slower.control.observer_radps < config.control.observer_radps
     settings, _ = loop_settings(slower)
     later = margins(replace(settings, delay_s=settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)))
     assert later.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert slower.control.kv == config.control.kv
-    assert with_slow_observer(config, fit, config.control.observer_radps) is config
+    assert with_slow_observer(config, fit.intervals(), config.control.observer_radps) is config
 
 
 SLUGGISH = {"kp": 141.0, "kv": 9.68, "observer_radps": 27.4, "cutoff_Hz": 5.46, "link_cutoff_Hz": 60.0}
@@ -139,7 +147,7 @@ def test_learning_that_is_slow_at_one_frequency_is_kept_and_none_that_stands_sti
 ) -> None:
     """A factor of 0.9 was asked for, which no gains reach there: five of six soft joints did not learn at all."""
     fit = fit_of(*joint)
-    settings = replace(choose_gains(known(shipped("realistic"), fit), fit).best.settings, **gains)
+    settings = replace(choose_gains(known(shipped("realistic"), fit), fit.intervals()).best.settings, **gains)
     learning = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
     found = converging(settings, learning)
     assert (found is not None) == kept
@@ -151,7 +159,7 @@ def test_a_joint_that_is_late_beside_its_resonance_gets_a_low_filter_and_passes_
     """A light motor, a heavy link and 2.8 ms: kv was 5 behind a filter of 450 Hz, which friction made stick."""
     fit = fit_of(1.79, 2.85e-3, 1.36, 5.7e4)
     config = known(shipped("realistic", reducer__stiffness_Nmprad=3.6e4), fit)
-    found = choose_gains(config, fit)
+    found = choose_gains(config, fit.intervals())
     assert found.missed == {}
     assert found.control.velocity_cutoff_Hz < 40.0
     assert found.control.kv > 10.0
@@ -165,7 +173,7 @@ def test_a_joint_whose_loss_is_all_hysteresis_keeps_its_margin_without_it() -> N
     fit = fit_of(1.905, 2.57e-3, 1.496, 6.06e4)
     fit = replace(fit, values={**fit.values, "damping_Nmspr": Estimate(20.0, 1.0)})
     config = known(shipped("realistic", reducer__stiffness_Nmprad=3.79e4), fit)
-    found = choose_gains(config, fit)
+    found = choose_gains(config, fit.intervals())
     assert found.missed == {}
     assert found.control.kv > 8.0
     settings, _ = loop_settings(changed(config, control=found.control))
@@ -198,7 +206,7 @@ def test_joints_without_any_loss_are_hardly_damped() -> None:
 
 def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing() -> None:
     fit = fit_of(2.1, 1.8e-3, 1.1, 2.0e4)
-    found = choose_gains(known(shipped("realistic", margin__min_phase_margin_deg=89.0), fit), fit)
+    found = choose_gains(known(shipped("realistic", margin__min_phase_margin_deg=89.0), fit), fit.intervals())
     (name, share), *others = found.missed.items()
     assert name.startswith("phase margin of the gate")
     assert name.endswith("of 89 deg")
@@ -207,19 +215,20 @@ def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing(
 
 
 @pytest.mark.parametrize(
-    ("name", "law", "link_kgm2", "words"),
+    ("config", "law", "words"),
     [
-        ("precise", "two_encoders", 0.0, r"needs \[joint_encoder\]"),
-        ("realistic", "link_encoder", 1.1, r'needs encoder.side = "joint" and no \[joint_encoder\]'),
-        ("realistic", "two_encoders", 0.0, "needs a reducer that is seen to be soft"),
+        (shipped("precise"), "two_encoders", r"needs \[joint_encoder\]"),
+        (shipped("realistic"), "link_encoder", r'needs encoder.side = "joint" and no \[joint_encoder\]'),
+        (
+            shipped("realistic").model_copy(update={"reducer": None}),
+            "two_encoders",
+            "needs a reducer that is seen to be soft",
+        ),
     ],
 )
-def test_a_law_for_other_encoders_or_a_soft_reducer_is_refused(
-    name: str, law: str, link_kgm2: float, words: str
-) -> None:
-    fit = fit_of(2.1, 1.5e-3, link_kgm2, 2.6e4 if link_kgm2 else 0.0)
+def test_a_law_for_other_encoders_or_a_soft_reducer_is_refused(config: Config, law: str, words: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"--law \(={law}\) {words}"):
-        choose_gains(known(shipped(name), fit), fit, law)
+        choose_gains(config, Intervals(0.05), law)
 
 
 def test_a_better_belief_does_not_move_the_virtual_joint() -> None:

@@ -1,11 +1,11 @@
-"""Gains for an identified joint: the least modelled error of tracking that keeps the margins wherever the joint may be.
+"""Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
                                                             and lag at the late end, link at both ends of the payload
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
-    torque noise of the encoders' counts <= a share of limits.torque_max_Nm; with both encoders, as in
-                                            `flexible_gains`, at most some 0.8 Nm from cycle to cycle
+    torque noise of the encoders' counts <= a share of limits.torque_max_Nm; of a soft joint LARGEST_NOISE_Nm, some
+                                        0.8 Nm from cycle to cycle
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / RIPPLE_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
@@ -23,15 +23,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_NOISE_Nm, LARGEST_OBSERVER_radps
 from jointctl.tools.analysis.linear_loop import (
     Array,
     ComplexArray,
@@ -49,22 +47,23 @@ from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergen
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
-from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
-from jointctl.tools.experiments.controllers import from_file, paper_control
-from jointctl.tools.tuning.joint_fit import JointFit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from jointctl.tools.configuration.load import load_config, shipped_config
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
 UNSTABLE = 1e3
+KP_OF_KV = 1.5  # of kv^2, for the law of a flexible joint: with less damping a joint a little different is unstable
+LARGEST_OBSERVER_radps = 110.0  # of that law, for the same reason
+LARGEST_NOISE_Nm = 0.6
+LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
+LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be distinguished from an unstable one
 LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
 LEAST_STIFFNESS_SHARE = 0.1
 LEAST_LATE_s = 0.1e-3
 GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
+OF_RIGID = {"computed_torque_observer": "precise", "computed_torque_rbf": "paper"}  # control.kind and its law
 NEEDED = {
     Encoders.BOTH: "[joint_encoder] beside an encoder on the motor",
     Encoders.LINK: 'encoder.side = "joint" and no [joint_encoder]',
@@ -84,6 +83,20 @@ SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 3, 90
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """By what share that which a configuration says of its joint may be wrong; the last three of a soft reducer."""
+
+    inertia: float
+    late_s: float = 0.0  # of delay and lag together
+    stiffness: float = 0.0
+    link: float = 0.0  # of its inertia
+    tells_link: bool = True  # False: its share of the inertia is a guess, at the same resonance
+
+
+BELIEVED = Intervals(0.1)  # of a file that nothing was measured for
 
 
 @dataclass(frozen=True)
@@ -121,6 +134,8 @@ class Law:
             link_Hz = float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}")
             values["link_cutoff_Hz"] = min(settings.link_cutoff_Hz, link_Hz)
         values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
+        if "observer_radps" in values:
+            values["observer_radps"] = max(values["observer_radps"], LEAST_OBSERVER_radps)
         if "q" in values:
             values["q"] = (values["q"], values["q"])
         return replace(settings, **values)
@@ -137,23 +152,32 @@ class Law:
 
 LAWS = {
     "precise": Law(
-        "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
+        "precise", lambda: _control_of("precise"), ("kv", "observer_radps", "cutoff_Hz"),
         ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
     ),
     "paper": Law(
-        "paper", paper_control, ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
+        "paper", lambda: _control_of("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
     "two_encoders": Law(
-        "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
+        "two_encoders", lambda: _control_of("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
         most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.BOTH,
     ),
     "link_encoder": Law(
-        "link_encoder", lambda: from_file("realistic").control, ("kv", "observer_radps", "cutoff_Hz"),
+        "link_encoder", lambda: _control_of("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, LARGEST_OBSERVER_radps,
         most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.LINK,
     ),
 }  # fmt: skip
+_FLEXIBLE = {  # by what the law of a flexible joint reads
+    Encoders.BOTH: LAWS["two_encoders"],
+    Encoders.LINK: LAWS["link_encoder"],
+    Encoders.MOTOR: replace(LAWS["two_encoders"], name="motor_encoder", encoders=Encoders.MOTOR),
+}
+
+
+def _control_of(name: str) -> Control:
+    return load_config(shipped_config(name)).control
 
 
 def require_encoders(config: Config, wanted: str) -> None:
@@ -169,14 +193,14 @@ def _encoders_of(config: Config) -> Encoders:
     return Encoders.MOTOR if config.joint_encoder is None else Encoders.BOTH
 
 
-def chosen_law(config: Config, fit: JointFit, wanted: str) -> Law:
+def chosen_law(config: Config, wanted: str) -> Law:
     """`wanted` "auto": that of the encoders where the reducer is soft and one of them sees the link, else precise."""
     if wanted == "auto":
-        there = _encoders_of(config) if fit.flexible else None
+        there = None if config.reducer is None else _encoders_of(config)
         fitting = (name for name, law in LAWS.items() if there is not None and law.encoders == there)
         return LAWS[next(fitting, "precise")]
     require_encoders(config, wanted)
-    if LAWS[wanted].encoders is not None and not fit.flexible:
+    if LAWS[wanted].encoders is not None and config.reducer is None:
         raise ConfigurationError(f"--law (={wanted}) needs a reducer that is seen to be soft")
     return LAWS[wanted]
 
@@ -213,6 +237,8 @@ class Goals:
                 1.0 - one.phase_margin_deg / PHASE_MARGIN_deg,
             f"gain margin {one.gain_margin:.2f} of {GAIN_MARGIN:g}": 1.0 - one.gain_margin / GAIN_MARGIN,
             f"|S| {one.sensitivity:.2f}, {SENSITIVITY:g} at most": one.sensitivity / SENSITIVITY - 1.0,
+            f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
+                math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
             f"torque noise {one.noise_Nm:.2f} Nm, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
             f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:g} deg":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
@@ -226,7 +252,7 @@ class Goals:
 class ChosenGains:
     """What the search found, and everything it tried."""
 
-    law: str
+    law: Law
     objective: str
     best: Judged
     missed: dict[str, float]
@@ -239,33 +265,35 @@ class ChosenGains:
 
     def allows(self, one: Judged) -> bool:
         """Whether it could have been chosen: every goal is met, and the observer is no quicker than the law bears."""
-        return not self.missed_by(one) and LAWS[self.law].beyond(one.settings) == 0.0
+        return not self.missed_by(one) and self.law.beyond(one.settings) == 0.0
 
     def with_gains(self, one: Judged) -> Control:
         """[control] with the gains of another choice."""
-        update = _changes(one.settings, LAWS[self.law])
         learning = converging(one.settings, self.control.learning)
-        return self.control.model_copy(update={**update, "learning": learning})
+        return self.control.model_copy(update={**_changes(one.settings, self.law), "learning": learning})
+
+    def changes(self) -> dict[str, Any]:
+        """Keys of [control]: gains and filters of the best one."""
+        return _changes(self.best.settings, self.law)
 
 
-def identified_joints(config: Config, fit: JointFit) -> list[float | TwoMasses]:
+def joints_within(config: Config, intervals: Intervals) -> list[float | TwoMasses]:
     """The joint as it is believed, first, then at the ends of its intervals and of the payload."""
-    inertia = max(fit.inertia_kgm2.half / fit.inertia_kgm2.value, LEAST_INERTIA_SHARE)
+    inertia = max(intervals.inertia, LEAST_INERTIA_SHARE)
     payload = sorted({1.0, *config.margin.payload_range})
     ends = (1.0, 1.0 - inertia, 1.0 + inertia)
     if config.reducer is None:
         factors = [p * end for p in payload for end in ends] if _payload_given(config) else list(ends)
         return [config.joint.inertia_kgm2 * factor for factor in (1.0, *factors)]
-    stiffness = max(fit.stiffness_Nmprad.half / fit.stiffness_Nmprad.value, LEAST_STIFFNESS_SHARE)
+    stiffness = max(intervals.stiffness, LEAST_STIFFNESS_SHARE)
     believed = two_masses(config, config.reducer, 1.0, 1.0, False)
     found = [believed, *(replace(believed, motor_kgm2=end * believed.motor_kgm2) for end in ends[1:])]
     sides = (-1.0, 1.0)
-    if fit.tells_link:
-        link = max(fit.link_kgm2.half / fit.link_kgm2.value, LEAST_INERTIA_SHARE)
+    if intervals.tells_link:
+        link = max(intervals.link, LEAST_INERTIA_SHARE)
         shares = [replace(believed, link_kgm2=(1.0 + side * link) * believed.link_kgm2) for side in sides]
     else:
-        stiffness = max(2.0 * fit.resonance_Hz.half / fit.resonance_Hz.value, LEAST_STIFFNESS_SHARE)
-        half = min(fit.link_kgm2.half, 0.9 * min(believed.link_kgm2, believed.motor_kgm2))
+        half = min(intervals.link * believed.link_kgm2, 0.9 * min(believed.link_kgm2, believed.motor_kgm2))
         shares = [_with_link(believed, believed.link_kgm2 + side * half) for side in sides]
     found += [
         replace(one, link_kgm2=p * one.link_kgm2, stiffness_Nmprad=(1.0 + side * stiffness) * one.stiffness_Nmprad)
@@ -306,25 +334,29 @@ def _payload_given(config: Config) -> bool:
     return "payload_range" in config.margin.model_fields_set
 
 
-def _late_s(settings: LoopSettings, fit: JointFit) -> float:
-    """The loop delay at the late end of what was identified."""
-    return settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
+def _latest_s(settings: LoopSettings, intervals: Intervals) -> float:
+    """The loop delay at the late end."""
+    return settings.delay_s + max(intervals.late_s, LEAST_LATE_s)
 
 
 class _Search:
-    def __init__(self, config: Config, law: Law, fit: JointFit, settings: LoopSettings) -> None:
+    def __init__(self, config: Config, law: Law, intervals: Intervals, settings: LoopSettings) -> None:
         self.law, self.nominal = law, settings
         self.tried: list[Judged] = []
         period_s = self.nominal.period_s
         self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
-        late_s = _late_s(settings, fit)
+        late_s = _latest_s(settings, intervals)
         joints = [
             sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders)
-            for joint in identified_joints(config, fit)
+            for joint in joints_within(config, intervals)
         ]
         self._of_goals = len(joints)
+        # the link is what is to be where it should be, whichever encoder the law reads
+        believed = joints_within(config, intervals)[0]
+        link = sampled_joint(period_s, late_s, settings.lag_s, believed, Encoders.BOTH).response(self._z)
+        self._link = link[:, 0, 0]
         joints += [linear_loop(case).joint for case in cases(settings)]
         lossless = lossless_joints(config)
         large = steady_joints(config) + lossless
@@ -367,7 +399,7 @@ class _Search:
         gate = slice(self._of_goals, None)
         response = self._responses[0]
         sensitivity = 1.0 / (1.0 - (law @ response)[:, 0, 0])
-        error = response[:, 0, 0] * sensitivity * np.hypot(1.0 / self._omega, 1.0 / RIPPLE_radps)
+        error = self._link * sensitivity * np.hypot(1.0 / self._omega, 1.0 / RIPPLE_radps)
         noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
         return Judged(
             settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
@@ -407,15 +439,37 @@ def _margins(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
     return phase, gain, np.max(1.0 / np.abs(1.0 + open_loop), axis=1)
 
 
-def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective: str = "tracking") -> ChosenGains:
-    """For a configuration that holds what was identified; some seconds."""
-    law = chosen_law(config, fit, wanted)
-    control = _control(config, law.control())
-    ready = config.model_copy(update={"control": control})
-    settings, _ = loop_settings(ready)
+def choose_gains(
+    config: Config, intervals: Intervals, wanted: str = "auto", objective: str = "tracking"
+) -> ChosenGains:
+    """With a law for the joint that was identified, which the configuration holds; a second."""
+    law = chosen_law(config, wanted)
+    ready = config.model_copy(update={"control": _control(config, law.control())})
+    return _chosen(ready, law, intervals, loop_settings(ready)[0], objective)
+
+
+def gains_of_file(config: Config, settings: LoopSettings) -> ChosenGains:
+    """For the law of a configuration, whose loop is `settings`, on the joint that it believes in; a second."""
+    kind = config.control.kind
+    if kind == "flexible_joint":
+        law = _FLEXIBLE[settings.encoders]
+    elif kind in OF_RIGID:
+        law = LAWS[OF_RIGID[kind]]
+    else:
+        known = ", ".join(("flexible_joint", *OF_RIGID))
+        raise ConfigurationError(f"{config.path}: gains are chosen for control.kind (={kind}) of {known} only")
+    if kind in OBSERVING_LAWS:
+        settings = replace(settings, observer_delay_cycles=_observed_late(settings.delay_s + settings.lag_s, config))
+    return _chosen(config, law, BELIEVED, settings, "tracking")
+
+
+def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettings, objective: str) -> ChosenGains:
+    """The search, from the [control] of the configuration."""
+    from scipy.optimize import minimize  # here: only a search waits for it
+
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
     goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s)
-    search = _Search(ready, law, fit, settings)
+    search = _Search(config, law, intervals, settings)
 
     def cost(one: Judged, least_error: float | None) -> float:
         if not one.stable:
@@ -446,9 +500,9 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     best = best_of(None)
     if objective == "quiet" and best.stable:
         best = best_of(best.error)
-    chosen = control.model_copy(update=_changes(best.settings, law))
+    chosen = config.control.model_copy(update=_changes(best.settings, law))
     return ChosenGains(
-        law.name, objective, best, goals.missed(best), tuple(search.tried), goals,
+        law, objective, best, goals.missed(best), tuple(search.tried), goals,
         chosen.model_copy(update={"learning": converging(best.settings, chosen.learning)}),
     )  # fmt: skip
 
@@ -471,9 +525,14 @@ def _control(config: Config, control: Control) -> Control:
         "adaptation": adaptation, "observer_paired": paired,
     }  # fmt: skip
     if observes:
-        update["observer_delay_cycles"] = min(max(round(late_s * config.loop.rate_Hz), 1), 15)
+        update["observer_delay_cycles"] = _observed_late(late_s, config)
         update["learning"] = control.learning or config.control.learning
     return control.model_copy(update=update)
+
+
+def _observed_late(late_s: float, config: Config) -> int:
+    """control.observer_delay_cycles for that much of delay and lag."""
+    return min(max(round(late_s * config.loop.rate_Hz), 1), 15)
 
 
 def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
@@ -481,9 +540,10 @@ def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
     named: dict[str, Any] = {"kp": settings.kp, "kv": settings.kv}
     if "observer_radps" in law.keys:
         named["observer_radps"] = settings.observer_radps
+        named["observer_delay_cycles"] = settings.observer_delay_cycles
     if "cutoff_Hz" in law.keys:
         named["velocity_cutoff_Hz"] = settings.cutoff_Hz
-    if settings.kind == ControllerKind.FLEXIBLE_JOINT:
+    if settings.kind == ControllerKind.FLEXIBLE_JOINT and settings.encoders == Encoders.BOTH:
         named["link_cutoff_Hz"] = settings.link_cutoff_Hz
     if "q" in law.keys:
         named["lyapunov_q"] = settings.q
@@ -516,7 +576,7 @@ def converging(settings: LoopSettings, learning: Learning | None) -> Learning | 
     return slow
 
 
-def with_slow_observer(config: Config, fit: JointFit, most_radps: float) -> Config:
+def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) -> Config:
     """With an observer of at most that bandwidth, or as slow as the gate allows at the late end of delay and lag.
 
     With both encoders of a soft joint the observer damps the link, too: it cannot be as slow as one likes.
@@ -525,7 +585,7 @@ def with_slow_observer(config: Config, fit: JointFit, most_radps: float) -> Conf
     if chosen_radps <= most_radps:
         return config
     settings, _ = loop_settings(config)
-    settings = replace(settings, delay_s=_late_s(settings, fit))
+    settings = replace(settings, delay_s=_latest_s(settings, intervals))
     for radps in np.linspace(most_radps, chosen_radps, SLOW_OBSERVERS):
         observer_radps = float(f"{radps:.3g}")
         slower = replace(settings, observer_radps=observer_radps)
@@ -534,31 +594,3 @@ def with_slow_observer(config: Config, fit: JointFit, most_radps: float) -> Conf
                 update={"control": config.control.model_copy(update={"observer_radps": observer_radps})}
             )
     return config
-
-
-# --- the picture ---
-
-
-def trade_off_figure(found: ChosenGains, title: str) -> Figure:
-    """Error against phase margin of everything that was tried; what keeps the margins is blue."""
-    stable = [one for one in found.tried if one.stable]
-    with canvas(4.2, title) as figure:
-        axis = figure.subplots()
-        for colour, label, chosen in (
-            (GREY, "misses a goal", [one for one in stable if not found.allows(one)]),
-            (BLUE, "meets all goals", [one for one in stable if found.allows(one)]),
-            (ORANGE, "chosen", [found.best]),
-        ):
-            size = 60 if label == "chosen" else 10
-            axis.scatter(
-                [one.phase_margin_deg for one in chosen], [one.error / found.best.error for one in chosen], s=size,
-                color=colour, label=label, zorder=3 if label == "chosen" else 2,
-            )  # fmt: skip
-        axis.axvline(PHASE_MARGIN_deg, color=RED, linewidth=0.8)
-        axis.set_yscale("log")
-        axis.set_ylim(0.3, 30.0)
-        axis.set_xmargin(0.03)
-        axis.set_xlabel("phase margin of the worst joint in the intervals [deg]")
-        axis.set_ylabel("modelled error / that of the chosen point")
-        axis.legend()
-        return figure
