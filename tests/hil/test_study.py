@@ -345,6 +345,12 @@ def test_a_law_for_flexible_joints_may_be_run_on_any_base_that_gets_a_reducer() 
     assert study(settings, Output(stdout=io.StringIO(), stderr=io.StringIO()), workers=Workers(1)) == 0
 
 
+def test_rigid_joints_are_not_drawn_from_a_base_with_a_soft_reducer() -> None:
+    settings = checked({"plants": 1, "base": "realistic", "controllers": ["precise"]}, "test")
+    with pytest.raises(ConfigurationError, match=r"base \(=realistic\) has a \[reducer\], .* --plants realistic"):
+        study(settings, Output(stdout=io.StringIO(), stderr=io.StringIO()), workers=Workers(1))
+
+
 @pytest.mark.parametrize("word", ["0", "-1", "many", "1.5", ""])
 def test_plants_that_are_neither_are_refused(word: str) -> None:
     with pytest.raises(ConfigurationError, match=r"plants \(="):

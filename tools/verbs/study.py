@@ -90,6 +90,10 @@ def study(
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
     require_simulated(base, "study")
+    if base.reducer is not None and not settings.plant.flexible:
+        raise ConfigurationError(
+            f"base (={settings.base}) has a [reducer], and rigid joints are drawn: --plants realistic"
+        )
     inputs = [Path(name) for name in (settings.base, *settings.controllers)] + ([file] if file is not None else [])
     if csv is not None:
         refuse_overwriting(csv, inputs)
