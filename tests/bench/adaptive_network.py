@@ -36,9 +36,9 @@ from jointctl.tools.analysis.linear_loop import loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import joint_rad_per_count  # noqa: E402
-from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.configuration.load import load_config, shipped_config, shipped_control  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
-from jointctl.tools.experiments.controllers import changed, paper_control  # noqa: E402
+from jointctl.tools.experiments.controllers import changed  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 
 RUN_s, FROM_s, RUNS, LEARN_s = 40.0, 20.0, 6, 20.0
@@ -163,7 +163,9 @@ def main() -> None:
     base = load_config(shipped_config("precise"))
     first = np.empty(0)
     for name, (changes, kind) in CASES.items():
-        control = changed(paper_control(), {"feed_forward": "lugre_desired", "zero_rule": "zero", **changes}, name)
+        control = changed(
+            shipped_control("paper"), {"feed_forward": "lugre_desired", "zero_rule": "zero", **changes}, name
+        )
         found = []
         for index in range(given.plants):
             plant = random_plant(base, EnsembleSettings(), given.seed, index)

@@ -120,9 +120,10 @@ def test_a_response_alone_of_a_light_joint_has_the_law_of_a_tune(
 ) -> None:
     """The friction of its configuration tells; a weak law stood still."""
     monkeypatch.chdir(tmp_path)
-    output, out, _ = outputs()
+    output, out, err = outputs()
     config = load_config(written(tmp_path / "light.toml", "precise", **LIGHT))
     assert response(config, output, options=IN_LOCKSTEP) == 0
+    assert f"law: {FED_STIFF}" in err.getvalue()
     found = json.loads(out.getvalue())["fit"]["values"]["inertia_kgm2"]
     assert found["value"] == pytest.approx(0.3, abs=found["half"])
     assert found["half"] < 0.1
@@ -243,7 +244,7 @@ def test_gains_that_measure_better_bring_their_own_margins(wrong: Path, monkeypa
         ("realistic", {**STIFF, "virtual__reducer_stiffness_Nmprad": 1.6e6}, ConfigurationError,
          r"response: .*: \[reducer\] has a resonance at 36 Hz, and the response shows none; .*correct \[reducer\]"),
         ("realistic", {**STIFF, "virtual__reducer_stiffness_Nmprad": 2e5}, ConfigurationError,
-         r"response: .*: reducer.loop_stiffness_Nmprad \(=\d+\) must be at most 310000, .*correct \[reducer\]"),
+         r"response: .*: reducer.loop_stiffness_Nmprad \(=\d+\) must be at most 310000, .*correct that section"),
     ],
 )  # fmt: skip
 def test_a_joint_that_does_not_move_as_it_should_ends_it_in_one_line(

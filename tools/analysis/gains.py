@@ -47,7 +47,7 @@ from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergen
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import shipped_control
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
@@ -132,7 +132,7 @@ class Law:
         if "cutoff_Hz" in values:
             values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
             link_Hz = float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}")
-            values["link_cutoff_Hz"] = min(settings.link_cutoff_Hz, link_Hz)
+            values["link_cutoff_Hz"] = min(settings.link_cutoff_Hz or math.inf, link_Hz)  # 0: no filter
         values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
         if "observer_radps" in values:
             values["observer_radps"] = max(values["observer_radps"], LEAST_OBSERVER_radps)
@@ -152,19 +152,19 @@ class Law:
 
 LAWS = {
     "precise": Law(
-        "precise", lambda: _control_of("precise"), ("kv", "observer_radps", "cutoff_Hz"),
+        "precise", lambda: shipped_control("precise"), ("kv", "observer_radps", "cutoff_Hz"),
         ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
     ),
     "paper": Law(
-        "paper", lambda: _control_of("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
+        "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
     "two_encoders": Law(
-        "two_encoders", lambda: _control_of("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
+        "two_encoders", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
         most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.BOTH,
     ),
     "link_encoder": Law(
-        "link_encoder", lambda: _control_of("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
+        "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, LARGEST_OBSERVER_radps,
         most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.LINK,
     ),
@@ -174,10 +174,6 @@ _FLEXIBLE = {  # by what the law of a flexible joint reads
     Encoders.LINK: LAWS["link_encoder"],
     Encoders.MOTOR: replace(LAWS["two_encoders"], name="motor_encoder", encoders=Encoders.MOTOR),
 }
-
-
-def _control_of(name: str) -> Control:
-    return load_config(shipped_config(name)).control
 
 
 def require_encoders(config: Config, wanted: str) -> None:

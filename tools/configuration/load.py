@@ -29,7 +29,14 @@ from jointctl.firmware_py.input_file import (
     require_input,
 )
 from jointctl.firmware_py.trajectory import spline_table
-from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, ConfigurationProblems, problem_lines, raise_if
+from jointctl.tools.configuration.config import (
+    SHIPPED_FOLDER,
+    Config,
+    ConfigurationProblems,
+    Control,
+    problem_lines,
+    raise_if,
+)
 from jointctl.tools.configuration.drive_section import GivenPlace, completed
 
 SPELT_ALIKE = 0.7  # of difflib's ratio
@@ -40,6 +47,11 @@ def shipped_config(name: str) -> Path:
     if (arm := SHIPPED_FOLDER / name / f"{name}.toml").is_file():
         return arm
     return SHIPPED_FOLDER / (name if name.endswith(".toml") else f"{name}.toml")
+
+
+def shipped_control(name: str) -> Control:
+    """[control] of a configuration shipped with the package."""
+    return load_config(shipped_config(name)).control
 
 
 def _meant(path: Path) -> str:

@@ -21,7 +21,7 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.drive_section import require_simulated
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import load_config, shipped_config, shipped_control
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.configuration.sections import Friction
 
@@ -60,11 +60,6 @@ class Controller:
     cascade: Mapping[str, Any] = field(default_factory=dict)  # keys of [drive.cascade] that differ from the base's
 
 
-def paper_control() -> Control:
-    """[control] of configs/paper.toml."""
-    return load_config(shipped_config("paper")).control
-
-
 def changed(control: Control, changes: Mapping[str, Any], name: str) -> Control:
     """`control` with some keys replaced, checked like a file; `name` is what the message calls it."""
     values = control.model_dump()
@@ -85,7 +80,7 @@ def one_line(error: ValidationError, origin: str) -> str:
 
 def named(names: tuple[str, ...] = DEFAULT) -> list[Controller]:
     """Entries of the table; the name of a shipped or of any other configuration file takes that file's law."""
-    paper = paper_control()
+    paper = shipped_control("paper")
     found = []
     for name in names:
         if name in TABLE:
@@ -133,10 +128,10 @@ def controller_config(base: Config, controller: Controller) -> Config:
 
 
 def with_chosen_gains(base: Config, controller: Controller) -> Controller:
-    """The law with gains for what is believed of the base joint."""
+    """The law with gains for what is believed of the base joint, and learning that converges on it."""
     config = controller_config(base, controller)
-    changes = gains_of_file(config, loop_settings(config)[0]).changes()
-    return Controller(controller.name, changed(controller.control, changes, controller.name), controller.friction)
+    control = gains_of_file(config, loop_settings(config)[0]).control
+    return Controller(controller.name, control, controller.friction)
 
 
 def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:

@@ -22,9 +22,9 @@ from jointctl.drivers.errors import MotionFault
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import load_config, shipped_config, shipped_control
 from jointctl.tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
-from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, from_file, paper_control
+from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, from_file
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, Scenario, error_figures, event_s, run_scenario
 from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
@@ -99,7 +99,7 @@ def _at_once(config: Config) -> Config:
 
 def law(name: str, **changes: Any) -> Controller:
     """The paper's law with some keys of [control] changed."""
-    return Controller(name, changed(paper_control(), changes, name))
+    return Controller(name, changed(shipped_control("paper"), changes, name))
 
 
 def experiments() -> list[Experiment]:

@@ -237,17 +237,23 @@ class ResponseTask:
 def response_task(config: Config, torque_Nm: float | None, legs: int, law: ResponseLaw = WEAK) -> ResponseTask:
     """`torque_Nm` at most, None: what fits the joint; `UsageError` where they or the limits do not fit.
 
-    With that law, or with that of the configuration where the gate refuses it: on a joint that is known to be soft,
-    with a light motor and a long delay.
+    With that law, or with that of the configuration where the gate refuses the weak one: on a joint that is known to
+    be soft, with a light motor and a long delay.
     """
     if not LEAST_LEGS <= legs <= MOST_LEGS:
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
     moving = config_of_response(config, torque_Nm, law)
-    with contextlib.suppress(ConfigurationError):  # a law whose margins are not known: the gate says so later
-        if not meets(margins(loop_settings(moving)[0]), moving.margin.min_phase_margin_deg):
-            moving = config_of_response(config, torque_Nm, None)
+    if law is WEAK and not _passes(moving):
+        moving = config_of_response(config, torque_Nm, None)
     _, length_s = speed_and_period(moving)
     return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), legs // 2, largest_peak_Nm(moving))
+
+
+def _passes(config: Config) -> bool:
+    """Whether the margin gate will; True where margins are not known, as the gate says itself."""
+    with contextlib.suppress(ConfigurationError):
+        return meets(margins(loop_settings(config)[0]), config.margin.min_phase_margin_deg)
+    return True
 
 
 def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyResponse, Any, ResponsePlan]:
@@ -298,9 +304,9 @@ FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it
 
 
 def task_by(law: str, before: Config, legs: int, torque_Nm: float | None = None) -> ResponseTask:
-    """By one of these laws; a friction of `before` that is not fed forward is known at standstill alone."""
+    """By one of these laws; `before`: with the torque to break away, of which nothing is fed forward."""
     static_Nm = static_friction_Nm(before) or 0.0
-    if law != ALONE and static_Nm > 0.0 and before.control.feed_forward == "none":
+    if law != ALONE and static_Nm > 0.0:
         fed_Nm = FED_SHARE * static_Nm
         before = with_sliding(before, static_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
     return response_task(before, torque_Nm, legs, _LAWS.get(law, WEAK))
@@ -312,12 +318,14 @@ def response_by_any_law(
     """(law, its task, what it measured), with the next law where one is too weak; faults as `measured_response`."""
     static_Nm = static_friction_Nm(before) or 0.0
     much = static_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
-    laws: tuple[str, ...] = _MUCH_FRICTION if much else _LITTLE_FRICTION
-    if static_Nm == 0.0 or before.control.feed_forward != "none":  # the weak law has it already, or there is none
-        laws = tuple(law for law in laws if law != FED)
+    laws = [law for law in (_MUCH_FRICTION if much else _LITTLE_FRICTION) if law != FED or static_Nm > 0.0]
+    if not _passes(task_by(FED_STIFF, before, legs, torque_Nm).config):
+        laws.remove(FED_STIFF)
 
     def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
         task = task_by(law, before, legs, torque_Nm)
+        if law != ALONE:
+            carrier.output.note(f"  law: {law}")
         try:
             return law, task, measured_response(task, carrier)
         except TooWeak as error:

@@ -290,7 +290,7 @@ class ResponseMotion:
         plan, config = self.plan, self.config
         top = float(np.max(np.abs(plan.legs.velocity_radps)))
         duration_s = len(plan.legs.velocity_radps) / config.loop.rate_Hz
-        frequency = plan.sine.frequency_Hz
+        frequency, control = plan.sine.frequency_Hz, config.control
         return [
             *joint_lines(report),
             f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
@@ -299,6 +299,8 @@ class ResponseMotion:
             f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
             f"at first {plan.peak_Nm:.2f} Nm on top of what the motion takes; the same again with more while the "
             f"coherence is low, up to {self.most_Nm:.2f} Nm, about 2 minutes in all",
+            f"law        kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s; "
+            "a stiffer one follows where the weak one is too weak for the friction",
             limits_line(config.limits),
             *remark_lines(report.remarks),
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,7 @@ import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import UsageError
-from jointctl.firmware_py.states import CommandKind
+from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
 if TYPE_CHECKING:
@@ -214,16 +215,32 @@ def _add_gains(table: Table, config: Config, settings: LoopSettings) -> dict[str
     chosen = gains_of_file(config, settings)
     gains, found = chosen.best, margins(chosen.best.settings)
     met, changes = not chosen.missed and meets(found, config.margin.min_phase_margin_deg), chosen.changes()
+    learning = chosen.control.learning
+    if learning != config.control.learning:  # so that it converges with these gains
+        before = {} if config.control.learning is None else config.control.learning.model_dump()
+        changes["learning"] = learning and {
+            key: value for key, value in learning.model_dump().items() if value != before.get(key)
+        }
     note = f"phase margin {found.phase_margin_deg:.1f} deg, " if found.stable else "UNSTABLE, "
-    largest_s = max(gains.sensitivity, gains.gate_sensitivity)
-    note += f"largest |S| {largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
-    note += "" if met else ": NOT what is asked for, there are no such gains; less delay, or the other encoder too"
-    words = (f"{name} = {value[0] if isinstance(value, tuple) else value:g}" for name, value in changes.items())
-    table.add_row("chosen gains", ", ".join(words), note)
+    note += f"|S| {found.sensitivity_peak:.2f} at most, torque noise {gains.noise_Nm:.2f} Nm"
+    if not met:
+        one_encoder = config.reducer is not None and settings.encoders != Encoders.BOTH
+        note += ": NOT what is asked for, there are no such gains; less delay"
+        note += ", or the other encoder too" if one_encoder else ""
+    table.add_row("chosen gains", ", ".join(_words(changes)), note)
     return {
-        "changes": changes, "met": met, "phase_margin_deg": found.phase_margin_deg, "largest_s": largest_s,
-        "noise_Nm": gains.noise_Nm,
+        "changes": changes, "met": met, "phase_margin_deg": found.phase_margin_deg,
+        "largest_s": found.sensitivity_peak, "noise_Nm": gains.noise_Nm,
     }  # fmt: skip
+
+
+def _words(changes: dict[str, Any]) -> Iterator[str]:
+    for name, value in changes.items():
+        if isinstance(value, dict):
+            yield from _words({f"{name}.{key}": number for key, number in value.items()})
+        else:
+            shown = value[0] if isinstance(value, tuple) else value
+            yield f"no {name}" if shown is None else f"{name} = {shown:g}"
 
 
 def learning_data(learning: Convergence | None) -> dict[str, float] | None:

@@ -67,11 +67,18 @@ def response(
     import contextlib
 
     from jointctl.tools.configuration.conversions import static_friction_Nm
+    from jointctl.tools.configuration.found_values import with_break_away, without_friction
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import TerminalConsent, require_terminal
+    from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.session.result import never_begun, require_off
-    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, response_by_any_law, response_task
+    from jointctl.tools.tuning.carry_out import (
+        Carrier,
+        NotCarriedOut,
+        ShownConsent,
+        response_by_any_law,
+        response_task,
+    )
     from jointctl.tools.tuning.frequency_response import bode_figure
     from jointctl.tools.tuning.joint_fit import fit_of
     from jointctl.tools.written_file import replace_file, require_target
@@ -81,15 +88,17 @@ def response(
         raise DataError(f"-o (={file}) must end in .json")
     require_png(picture, [config.path])
     require_target(file, [config.path])
-    task = response_task(config, options.torque_Nm, options.legs)
+    static_Nm = static_friction_Nm(config) or 0.0
+    before = with_break_away(config, static_Nm) if static_Nm > 0.0 else without_friction(config)
+    task = response_task(before, options.torque_Nm, options.legs)
     if not (assume_yes or dry_run or options.lockstep):
         require_terminal()
-    consent = TerminalConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)
+    consent = ShownConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)
     with contextlib.ExitStack() as stack:
         control = None if options.lockstep else stack.enter_context(in_control(task.config, output))
         try:
             carrier = Carrier(output, consent, control, allow_low_margin)
-            found = response_by_any_law(config, options.legs, carrier, options.torque_Nm)[-1][0]
+            found = response_by_any_law(before, options.legs, carrier, options.torque_Nm)[-1][0]
         except NotCarriedOut as ended:
             if ended.stopped_by:
                 output.note(f"stopped by {ended.stopped_by}; no response")
@@ -98,7 +107,7 @@ def response(
             return never_begun(ended.drive_state, output, dry_run=dry_run)
     result, fit = found.to_dict(), None
     try:
-        fit = fit_of(found, config, static_friction_Nm(config) or 0.0)
+        fit = fit_of(found, config, static_Nm)
         result["fit"] = fit.to_dict()
     finally:  # what was measured is kept where no model fits
         replace_file(file, json.dumps(result, indent=1).encode())

@@ -305,15 +305,18 @@ class Tune:
         gains = self.chosen_gains(self.options.law, "tracking")
         self._require(gains)
         self.config = self._with_control(gains.control)
+        problems = problems_between_sections(self.config)
+        if problems:  # the file could not be written at the end
+            hint = "the joint is another one than the file says: correct that section, or take it out"
+            raise ConfigurationError(f"{self.original.path}: {problems[0]}", hint)
 
     def _require_reducer(self) -> None:
-        """`ConfigurationError` where [reducer] is of another joint than what answered, whatever came later."""
-        reducer, problems = self.original.reducer, problems_between_sections(self.config)
+        """`ConfigurationError` where [reducer] is of another joint than the one that answered."""
+        reducer = self.original.reducer
         if self.fit is not None and not self.fit.flexible and reducer is not None:
             resonance_Hz = two_masses(self.original, reducer, 1.0, 1.0, False).resonance_Hz
-            problems = [f"[reducer] has a resonance at {resonance_Hz:.0f} Hz, and the response shows none"]
-        if problems:
-            raise ConfigurationError(f"{self.original.path}: {problems[0]}", "correct [reducer], or take it out")
+            message = f"[reducer] has a resonance at {resonance_Hz:.0f} Hz, and the response shows none"
+            raise ConfigurationError(f"{self.original.path}: {message}", "correct [reducer], or take it out")
 
     def fitted(self) -> list[Found]:
         assert self.fit is not None
@@ -468,7 +471,7 @@ class Tune:
     def _require(gains: ChosenGains) -> None:
         if not gains.best.stable:
             raise MarginError(
-                f"no gains of the law {gains.law} are stable over the intervals of this joint",
+                f"no gains of the law {gains.law.name} are stable over the intervals of this joint",
                 "--law; a shorter loop delay; the encoder on the motor",
             )
 

@@ -21,7 +21,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, Encoders, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.hil.plant import plant, step_plant
-from jointctl.tools.analysis.gains import ChosenGains, gains_of_file
+from jointctl.tools.analysis.gains import ChosenGains, LEAST_KV_1ps, gains_of_file
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop, loop_settings
 from jointctl.tools.analysis.margin_gate import meets, require_margin
 from jointctl.tools.analysis.margins import (
@@ -280,8 +280,7 @@ def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> N
     config = with_encoders(believed(margin__min_phase_margin_deg=80.0), Encoders.MOTOR)
     found = chosen(config)
     assert found.missed
-    assert found.changes()["kv"] >= 1.0
-    assert found.changes()["observer_radps"] >= 0.1  # the pole of a slower one is called unstable
+    assert found.changes()["kv"] > 0.8 * LEAST_KV_1ps
     assert not chosen(with_encoders(believed(), Encoders.MOTOR)).missed
 
 

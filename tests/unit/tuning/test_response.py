@@ -412,6 +412,7 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
 
     def run(config: Any, *_: Any, **__: Any) -> Carried:
         laws.append((config.control.kp, config.control.feed_forward))
+        assert config.limits.torque_max_Nm == 55.0
         log = new(LogRecord, 100)
         log.phase, log.command_torque_Nm = AxisPhase.TRACKING, torque_Nm
         log.desired_position_rad = np.linspace(0.0, 0.05, len(log))
@@ -420,14 +421,31 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     before = with_break_away(shipped("precise"), 20.0)
     with pytest.raises(MotionFault, match=fault.name):
-        response_by_any_law(before, 8, carrier)
+        response_by_any_law(before, 8, carrier, 55.0)
     attempts = [(100.0, "none"), (100.0, "desired"), (1600.0, "desired")]
     assert laws == (attempts if weak else attempts[:1])
     laws.clear()
     light = changed(before, joint__inertia_kgm2=0.5)
     with pytest.raises(MotionFault, match=fault.name):
-        response_by_any_law(light, 8, carrier)
+        response_by_any_law(light, 8, carrier, 55.0)
     assert laws == (attempts[:0:-1] if weak else attempts[2:])
+
+
+@pytest.mark.parametrize(("name", "kps"), [("precise", [100.0, 1600.0]), ("realistic", [100.0])])
+def test_a_stiffer_law_follows_only_where_the_gate_lets_it(name: str, kps: list[float]) -> None:
+    """Without a friction nothing can be fed forward; the law of the file takes the place of the weak one alone."""
+    laws: list[float] = []
+
+    def run(config: Any, *_: Any, **__: Any) -> Carried:
+        laws.append(config.control.kp)
+        log = new(LogRecord, 100)
+        log.phase = AxisPhase.TRACKING
+        return Carried(log, Fault.FOLLOWING_ERROR, FaultText("happened", "cause", "next"), "", 0.1)
+
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
+    with pytest.raises(TooWeak):
+        response_by_any_law(without_friction(shipped(name)), 8, carrier)
+    assert laws == kps
 
 
 @pytest.mark.parametrize("coherence", [0.95, 0.85])
