@@ -568,7 +568,7 @@ def two_masses(config: Config, reducer: Reducer, payload: float, stiffness: floa
     words += ["held by friction" if held else "without friction"]
     return TwoMasses(
         reducer.motor_inertia_kgm2,
-        payload * (config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2),
+        payload * config.link_kgm2,
         stiffness * (reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad),
         reducer.damping_Nmspr,
         bristles,

@@ -175,6 +175,11 @@ class Config(Section):
         return self._text
 
     @property
+    def link_kgm2(self) -> float:
+        """Inertia behind the reducer; without one all of it."""
+        return self.joint.inertia_kgm2 - (0.0 if self.reducer is None else self.reducer.motor_inertia_kgm2)
+
+    @property
     def table_path(self) -> Path | None:
         return beside(self._path, self.trajectory.file) if self.trajectory.kind == "table" else None
 

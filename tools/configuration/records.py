@@ -237,7 +237,7 @@ def _fill_flexible(record: FlexibleConstants, config: Config, reducer: Reducer) 
     control, ratio = config.control, config.joint.reduction_ratio
     record.encoders = encoders_of_law(config)
     record.motor_inertia_kgm2 = reducer.motor_inertia_kgm2
-    record.link_inertia_kgm2 = config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2
+    record.link_inertia_kgm2 = config.link_kgm2
     record.link_friction_share = reducer.link_friction_share
     record.following_Nm = FOLLOWING_SHARE * config.limits.torque_max_Nm
     record.compliance_radpNm = compliance = 1.0 / reducer.stiffness_Nmprad
@@ -336,7 +336,7 @@ def _rounding_s(config: Config, trajectory: Trapezoid) -> float:
         return max(trajectory.acceleration_radps2 / trajectory.jerk_radps3, ROUNDING_CYCLES * period_s(config))
     if reducer is None:
         return 0.0
-    link_kgm2 = config.margin.payload_range[1] * (config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2)
+    link_kgm2 = config.margin.payload_range[1] * config.link_kgm2
     return math.tau * math.sqrt(link_kgm2 / reducer.stiffness_Nmprad)
 
 

@@ -319,7 +319,7 @@ def response_by_any_law(
     static_Nm = static_friction_Nm(before) or 0.0
     much = static_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
     laws = [law for law in (_MUCH_FRICTION if much else _LITTLE_FRICTION) if law != FED or static_Nm > 0.0]
-    if not _passes(task_by(FED_STIFF, before, legs, torque_Nm).config):
+    if not _passes(config_of_response(before, torque_Nm, STIFF)):
         laws.remove(FED_STIFF)
 
     def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:

@@ -127,7 +127,7 @@ def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
         caption_justify="left",
     )  # fmt: skip
     reducer, margin = config.reducer, config.margin
-    link = None if reducer is None else config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2
+    link = None if reducer is None else config.link_kgm2
     known = {
         "inertia_kgm2": config.joint.inertia_kgm2, "link_kgm2": link, "lag_s": margin.current_lag_s,
         "delay_s": margin.loop_delay_s,
