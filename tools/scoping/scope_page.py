@@ -441,7 +441,7 @@ class ScopePage:
 
     def __init__(self, order: ScopeOrder, history: History, link: Link | None) -> None:
         self._order, self._history, self._link = order, history, link
-        self._ticks = 0
+        self._ticks, self._told_end = 0, False
         self._draw_again_s = 0.0
         client: Any = ui.context.client
         self._who = viewer(getattr(client, "ip", None))
@@ -497,7 +497,9 @@ class ScopePage:
 
     def _refresh(self) -> None:
         self._ticks += 1
-        if self._ticks % SLOW == 1:
+        ended = self._history.ended and not self._told_end  # soon nobody can show it any more
+        if ended or self._ticks % SLOW == 1:
+            self._told_end = self._history.ended
             self._tell()
         now_s = time.monotonic()
         if now_s >= self._draw_again_s:

@@ -155,6 +155,9 @@ async def count_viewers(feed: Feed) -> None:
         await asyncio.sleep(COUNT_S)
 
 
+SHOW_END_S = 3.5  # for pages on a busy computer to show the end of the run; the supervisor waits for 5 s
+
+
 def serve(order: ScopeOrder) -> None:
     """Until the run ends, or for a log until it is interrupted."""
     # the import takes seconds, and only this process needs it
@@ -165,7 +168,7 @@ def serve(order: ScopeOrder) -> None:
     feed: Feed | None = None
     if order.feed_fd >= 0:
         history = History(RING_RECORDS, order.joints)
-        feed = Feed(socket.socket(fileno=order.feed_fd), history)
+        feed = Feed(socket.socket(fileno=order.feed_fd), history, SHOW_END_S)
         feed.start()
     else:
         history = history_of_log(order.log)

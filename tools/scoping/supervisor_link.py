@@ -34,7 +34,7 @@ from jointctl.tools.session.set_points import RemoteSetPoint
 
 LONGEST_BYTES = 1 << 20  # of a message
 NICE = 5  # a viewer comes after the supervisor, but STOP has to arrive on a busy computer
-_AFTER_END_S = 1.5  # for the pages to show the end of the run
+AFTER_END_S = 1.5  # for clients to get the last messages
 SET_POINTS_HZ = 1000.0  # of one server, at most
 BURST = 100  # that may come at once
 
@@ -62,10 +62,9 @@ class Watcher(Protocol):
 class Feed(threading.Thread):
     """Receives what the supervisor sends, until it closes the socket; then ends the server."""
 
-    def __init__(self, end: socket.socket, watcher: Watcher) -> None:
+    def __init__(self, end: socket.socket, watcher: Watcher, after_end_s: float = AFTER_END_S) -> None:
         super().__init__(name="feed", daemon=True)
-        self._end = end
-        self._watcher = watcher
+        self._end, self._watcher, self._after_end_s = end, watcher, after_end_s
         self._stops = 0  # since the stage has changed
 
     def run(self) -> None:
@@ -89,7 +88,7 @@ class Feed(threading.Thread):
                 self._watcher.take_settings(found)
             self._watcher.heard_s = time.monotonic()
         self._watcher.ended = True
-        time.sleep(_AFTER_END_S)
+        time.sleep(self._after_end_s)
         os._exit(0)  # the server itself would wait for every open page
 
     def stop(self, who: str) -> int:
