@@ -344,14 +344,11 @@ class _Search:
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
         late_s = _latest_s(settings, intervals)
-        joints = [
-            sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders)
-            for joint in joints_within(config, intervals)
-        ]
+        within = joints_within(config, intervals)
+        joints = [sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders) for joint in within]
         self._of_goals = len(joints)
         # the link is what is to be where it should be, whichever encoder the law reads
-        believed = joints_within(config, intervals)[0]
-        link = sampled_joint(period_s, late_s, settings.lag_s, believed, Encoders.BOTH).response(self._z)
+        link = sampled_joint(period_s, late_s, settings.lag_s, within[0], Encoders.BOTH).response(self._z)
         self._link = link[:, 0, 0]
         joints += [linear_loop(case).joint for case in cases(settings)]
         lossless = lossless_joints(config)

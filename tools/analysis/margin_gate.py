@@ -255,6 +255,11 @@ def meets(found: Margins, minimum_deg: float) -> bool:
     return found.stable and found.phase_margin_deg >= minimum_deg and found.sensitivity_accepted
 
 
+def passes(config: Config) -> bool:
+    """Whether the gate before enabling will let this loop be closed, as far as its delay is known."""
+    return meets(margins(loop_settings(config)[0]), config.margin.min_phase_margin_deg)
+
+
 def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes: list[Remedy]) -> MarginError:
     filtered = f"{settings.cutoff_Hz:g} Hz filter" if settings.cutoff_Hz > 0.0 else "no filter"
     where = (

@@ -21,9 +21,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import eased, spline_table
-from jointctl.tools.analysis.linear_loop import loop_settings
-from jointctl.tools.analysis.margin_gate import meets
-from jointctl.tools.analysis.margins import margins
+from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
     joint_rad_per_count,
@@ -121,14 +119,9 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
     plan = CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
     most = max(travel, min(TRAVEL_MAX_rad, TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)))
-    while plan.travel_rad < most and not _stable_enough(config_of_check(config, plan)):
+    while plan.travel_rad < most and not passes(config_of_check(config, plan)):
         plan = replace(plan, travel_rad=min(LONGER * plan.travel_rad, most))
     return plan
-
-
-def _stable_enough(config: Config) -> bool:
-    """Whether the gate before enabling will let it move, as far as the loop delay is known."""
-    return meets(margins(loop_settings(config)[0]), config.margin.min_phase_margin_deg)
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
