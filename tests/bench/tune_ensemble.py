@@ -149,7 +149,7 @@ def true_fit(config: Config, found: JointFit, true_kgm2: float, local: tuple[flo
         values |= {"link_kgm2": link, "stiffness_Nmprad": local[0], "resonance_Hz": local[1],
                    "damping_Nmspr": local[2]}  # fmt: skip
     estimates = {name: Estimate(values.get(name, 0.0), one.half) for name, one in found.values.items()}
-    return JointFit(virtual.flexible, estimates, found.period_s, found.rms, found.lines, found.criterion)
+    return replace(found, flexible=virtual.flexible, values=estimates, tells_link=True)
 
 
 def true_margin_deg(config: Config, true_kgm2: float) -> float:

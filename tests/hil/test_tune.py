@@ -26,7 +26,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
-from jointctl.tools.tuning.carry_out import FED_STIFF, Carrier
+from jointctl.tools.tuning.carry_out import FED_STIFF, FED_STIFFEST, Carrier
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
@@ -39,6 +39,10 @@ STIFF: dict[str, Any] = {"virtual__reducer_knees_Nm": (), "virtual__reducer_stif
 LIGHT: dict[str, Any] = {  # 0.3 kg m^2 that break away at 10 Nm
     "joint__inertia_kgm2": 0.375, "virtual__inertia_scale": 0.8, "virtual__friction_positive_scale": 0.55,
     "virtual__friction_negative_scale": 0.5,
+}  # fmt: skip
+STICKY: dict[str, Any] = {  # 0.11 kg m^2 that break away at 14 Nm, believed to be 0.055 kg m^2
+    "joint__inertia_kgm2": 0.055, "virtual__inertia_scale": 2.0, "virtual__friction_positive_scale": 0.8,
+    "virtual__friction_negative_scale": 0.75,
 }  # fmt: skip
 
 
@@ -103,16 +107,24 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
     assert (folder / "before.toml").read_text() == text
 
 
-def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_response(tmp_path: Path) -> None:
-    """A weak law swung or stood, and 9 Nm would turn it round."""
-    path = written(tmp_path / "light.toml", "precise", **LIGHT)
+@pytest.mark.parametrize(
+    ("joint", "law", "inertia_kgm2", "off", "rmse_mrad"),
+    [(LIGHT, FED_STIFF, 0.3, 0.08, 0.2), (STICKY, FED_STIFFEST, 0.11, 0.3, 0.2)],
+)
+def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_response(
+    tmp_path: Path, joint: dict[str, Any], law: str, inertia_kgm2: float, off: float, rmse_mrad: float
+) -> None:
+    """A weak law swung or stood, and 9 Nm would turn it round; gains with more margin stick and slide by turns."""
+    path = written(tmp_path / "light.toml", "precise", **joint)
     before = load_config(path)
     output, out, _ = outputs()
     assert tune(before, output, options=TuneOptions(lockstep=True)) == 0
     found, tuned = json.loads(out.getvalue()), load_config(path)
-    assert found["response"]["law"] == FED_STIFF
-    assert tuned.joint.inertia_kgm2 == pytest.approx(0.3, rel=0.08)
-    assert found["verification"]["after"]["rmse_mrad"] < 0.2
+    assert found["response"]["law"] == law
+    assert tuned.joint.inertia_kgm2 == pytest.approx(inertia_kgm2, rel=off)
+    assert found["verification"]["after"]["rmse_mrad"] < rmse_mrad
+    true = changed(tuned, joint__inertia_kgm2=inertia_kgm2, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
+    assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
 
 
 def test_a_response_alone_of_a_light_joint_has_the_law_of_a_tune(

@@ -1,7 +1,7 @@
 """Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
-                                                            and lag at the late end, link at both ends of the payload
+    (25, 1.7 and 3 where friction rules a rigid joint)      and lag at the late end, link at both ends of the payload
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
     torque noise of the encoders' counts <= a share of limits.torque_max_Nm; of a soft joint LARGEST_NOISE_Nm, some
@@ -15,6 +15,8 @@ as well, since it drives a resonance that is hardly damped.  By this error a qui
 on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit, and one far from
 the usual bandwidth costs a little: the error is flat there, and its least a matter of chance.  A goal that is missed
 costs in proportion, so that the result of a joint that does not allow all of them is the nearest one, and says so.
+A light joint with much friction sticks and slides by turns under a soft loop, which no margin shows, and its wide
+intervals are those of friction that looks like inertia: it keeps less at their ends.
 """
 
 from __future__ import annotations
@@ -46,10 +48,12 @@ from jointctl.tools.analysis.margin_gate import meets
 from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
-from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
+from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
 from jointctl.tools.configuration.load import shipped_control
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
+STICKY = (25.0, 1.7, 3.0)  # the same of a rigid joint that friction rules
+STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia, from where on and as from where
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
@@ -94,6 +98,7 @@ class Intervals:
     stiffness: float = 0.0
     link: float = 0.0  # of its inertia
     tells_link: bool = True  # False: its share of the inertia is a guess, at the same resonance
+    friction_radps2: float = 0.0  # no interval: static friction over the inertia of a rigid joint, see STICKY_radps2
 
 
 BELIEVED = Intervals(0.1)  # of a file that nothing was measured for
@@ -108,7 +113,6 @@ class Law:
     keys: tuple[str, ...]  # of LoopSettings, positive
     spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
     kp_of_kv: float
-
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
@@ -225,14 +229,17 @@ class Goals:
     noise_Nm: float
     gate_deg: float
     gate_sensitivity: float
+    phase_margin_deg: float
+    gain_margin: float
+    sensitivity: float
 
     def missed(self, one: Judged) -> dict[str, float]:
         """By what share each goal is missed; empty if none is."""
         shares = {
-            f"phase margin {one.phase_margin_deg:.1f} of {PHASE_MARGIN_deg:g} deg":
-                1.0 - one.phase_margin_deg / PHASE_MARGIN_deg,
-            f"gain margin {one.gain_margin:.2f} of {GAIN_MARGIN:g}": 1.0 - one.gain_margin / GAIN_MARGIN,
-            f"|S| {one.sensitivity:.2f}, {SENSITIVITY:g} at most": one.sensitivity / SENSITIVITY - 1.0,
+            f"phase margin {one.phase_margin_deg:.1f} of {self.phase_margin_deg:.3g} deg":
+                1.0 - one.phase_margin_deg / self.phase_margin_deg,
+            f"gain margin {one.gain_margin:.2f} of {self.gain_margin:.3g}": 1.0 - one.gain_margin / self.gain_margin,
+            f"|S| {one.sensitivity:.2f}, {self.sensitivity:.3g} at most": one.sensitivity / self.sensitivity - 1.0,
             f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
                 math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
             f"torque noise {one.noise_Nm:.2f} Nm, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
@@ -453,7 +460,9 @@ def gains_of_file(config: Config, settings: LoopSettings) -> ChosenGains:
         raise ConfigurationError(f"{config.path}: gains are chosen for control.kind (={kind}) of {known} only")
     if kind in OBSERVING_LAWS:
         settings = replace(settings, observer_delay_cycles=_observed_late(settings.delay_s + settings.lag_s, config))
-    return _chosen(config, law, BELIEVED, settings, "tracking")
+    friction_Nm = 0.0 if config.reducer is not None else static_friction_Nm(config) or 0.0
+    believed = replace(BELIEVED, friction_radps2=friction_Nm / config.joint.inertia_kgm2)
+    return _chosen(config, law, believed, settings, "tracking")
 
 
 def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettings, objective: str) -> ChosenGains:
@@ -461,7 +470,9 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     from scipy.optimize import minimize  # here: only a search waits for it
 
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
-    goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s)
+    ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY), STICKY, strict=True)
+    wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
+    goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s, *wanted)
     search = _Search(config, law, intervals, settings)
 
     def cost(one: Judged, least_error: float | None) -> float:

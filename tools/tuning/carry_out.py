@@ -41,6 +41,7 @@ from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
     LEAST_SHARE,
     STIFF,
+    STIFFEST,
     WEAK,
     FrequencyResponse,
     Multisine,
@@ -295,10 +296,12 @@ def _whole(
 # late where a leg ends.
 
 ALONE, FED, FED_STIFF = "the weak law", "a part of the friction fed forward", "a stiffer law, friction fed forward"
-_LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF}
-_LITTLE_FRICTION, _MUCH_FRICTION = (ALONE, FED, FED_STIFF), (FED_STIFF, FED)
+FED_STIFFEST = "the stiffest law, friction fed forward"
+_LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF, FED_STIFFEST: STIFFEST}
+_LITTLE_FRICTION, _MUCH_FRICTION = (ALONE, FED, FED_STIFF, FED_STIFFEST), (FED_STIFF, FED_STIFFEST, FED)
 MUCH_FRICTION_radps2 = 25.0  # torque to break away over the inertia that is believed
 FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
+HEAVIER = 1.6  # times the inertia that is believed: of a joint that swung slowly under the stiffer law
 
 
 def task_by(law: str, before: Config, legs: int, torque_Nm: float | None = None) -> ResponseTask:
@@ -317,11 +320,13 @@ def response_by_any_law(
     static_Nm = static_friction_Nm(before) or 0.0
     much = static_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
     laws = [law for law in (_MUCH_FRICTION if much else _LITTLE_FRICTION) if law != FED or static_Nm > 0.0]
-    if not _passes(config_of_response(before, torque_Nm, STIFF)):
-        laws.remove(FED_STIFF)
+    for stiff in (FED_STIFF, FED_STIFFEST):
+        if not _passes(config_of_response(before, torque_Nm, _LAWS[stiff])):
+            laws.remove(stiff)
 
     def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
-        task = task_by(law, before, legs, torque_Nm)
+        believed = _with_inertia(before, HEAVIER * before.joint.inertia_kgm2) if law == FED_STIFFEST else before
+        task = task_by(law, believed, legs, torque_Nm)
         if law != ALONE:
             carrier.output.note(f"  law: {law}")
         try:
@@ -366,9 +371,13 @@ def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
         inertia = fit_joint(found, task.config.joint.inertia_kgm2).inertia_kgm2.value
     except DataError:
         return task
-    config = with_values(task.config, [Found(("joint",), "inertia_kgm2", rounded(inertia), "")])
+    config = _with_inertia(task.config, inertia)
     shown_Nm = task.largest_Nm
     return replace(task, config=config, largest_Nm=min(shown_Nm, largest_peak_Nm(config)))
+
+
+def _with_inertia(config: Config, inertia_kgm2: float) -> Config:
+    return with_values(config, [Found(("joint",), "inertia_kgm2", rounded(inertia_kgm2), "")])
 
 
 def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:

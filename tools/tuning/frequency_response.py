@@ -75,6 +75,7 @@ class ResponseLaw(NamedTuple):
 WEAK = ResponseLaw(100.0, 20.0, 15.0, 15.0)
 # for much friction on little inertia, under which the weak one stands or swings
 STIFF = ResponseLaw(1600.0, 80.0, 60.0, 120.0)
+STIFFEST = ResponseLaw(3200.0, 120.0, 60.0, 200.0)  # where that one swings: the inertia is more than is believed
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0)
 STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
+KNOWN_RESONANCE = 0.4  # half width of its interval over it, at most: a wider one is friction's, or none
 USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
 SHARE_SPREAD = 0.7  # of the motor's logarithm, or of link over motor: the link alone shows their sum and the resonance
 LATEST_s = 0.012  # of delay and of lag, at most
@@ -80,6 +81,7 @@ class JointFit:
     lines: int
     criterion: float  # by which the chosen model is better than the other one
     tells_link: bool = True  # False: its share of the inertia is believed, an encoder on the link alone does not see it
+    friction_radps2: float = 0.0  # torque to break away over the inertia
 
     def __getattr__(self, name: str) -> Estimate:
         try:
@@ -114,26 +116,27 @@ class JointFit:
             return self.values[name].half / self.values[name].value
 
         if not self.flexible:
-            return Intervals(share("inertia_kgm2"), self.late_s.half)
+            return Intervals(share("inertia_kgm2"), self.late_s.half, friction_radps2=self.friction_radps2)
         stiffness = share("stiffness_Nmprad") if self.tells_link else 2.0 * share("resonance_Hz")
         return Intervals(share("inertia_kgm2"), self.late_s.half, stiffness, share("link_kgm2"), self.tells_link)
 
     def beside_friction(self, break_away_Nm: float) -> JointFit:
         """Wider intervals where the friction is much for the inertia: where it slides it looks like a part of it."""
         inertia, late = self.inertia_kgm2, self.late_s
-        much = max(min(break_away_Nm / inertia.value, MOST_radps2) - LITTLE_radps2, 0.0)
+        friction_radps2 = break_away_Nm / inertia.value
+        much = max(min(friction_radps2, MOST_radps2) - LITTLE_radps2, 0.0)
         wider = {
             "inertia_kgm2": replace(inertia, half=math.hypot(inertia.half, FRICTION_SHARE * much * inertia.value)),
             "late_s": replace(late, half=math.hypot(late.half, FRICTION_LATE_s * much)),
         }
-        return replace(self, values={**self.values, **wider})
+        return replace(self, values={**self.values, **wider}, friction_radps2=friction_radps2)
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "model": "two masses" if self.flexible else "rigid",
             "values": {name: {"value": one.value, "half": one.half} for name, one in self.values.items()},
             "period_s": self.period_s, "rms": self.rms, "lines": self.lines, "criterion": self.criterion,
-            "tells_link": self.tells_link,
+            "tells_link": self.tells_link, "friction_radps2": self.friction_radps2,
         }  # fmt: skip
 
 
@@ -143,7 +146,7 @@ def fit_from_dict(found: dict[str, Any]) -> JointFit:
     values.setdefault("loss_factor", Estimate(0.0, 0.0))  # of a tune that was begun before there was one
     return JointFit(
         found["model"] == "two masses", values, found["period_s"], found["rms"], found["lines"], found["criterion"],
-        found.get("tells_link", True),
+        found.get("tells_link", True), found.get("friction_radps2", 0.0),
     )  # fmt: skip
 
 
@@ -296,13 +299,15 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float, motor_kgm2: float |
     two = min((soft.fitted(start) for start in starts[:STARTS]), key=lambda fit: fit.cost)
     better = rigid.criterion(one) - soft.criterion(two)
     highest = max(float(part.frequency_Hz[-1]) for part in parts)
-    flexible = better > BETTER and soft.joint(two.x).resonance_Hz < highest
+    values, flexible = _intervals(soft, two), better > BETTER and soft.joint(two.x).resonance_Hz < highest
+    flexible = flexible and values["resonance_Hz"].half <= KNOWN_RESONANCE * values["resonance_Hz"].value
     model, best = (soft, two) if flexible else (rigid, one)
+    values = values if flexible else _intervals(rigid, one)
     relative = [part.sigma for part in parts]
     measured = model.residuals(best.x)[len(model.believed(best.x)) :]
     weighted = measured * np.concatenate([np.concatenate((s, s)) for s in relative])
     return JointFit(
-        flexible, _intervals(model, best), found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
+        flexible, values, found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
         abs(better), model.tells_link,
     )  # fmt: skip
 

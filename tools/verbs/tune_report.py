@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.gains import ChosenGains, PHASE_MARGIN_deg
+from jointctl.tools.analysis.gains import ChosenGains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import map_figure
@@ -171,7 +171,7 @@ def trade_off_figure(found: ChosenGains, title: str) -> Figure:
                 [one.phase_margin_deg for one in chosen], [one.error / found.best.error for one in chosen], s=size,
                 color=colour, label=label, zorder=3 if label == "chosen" else 2,
             )  # fmt: skip
-        axis.axvline(PHASE_MARGIN_deg, color=RED, linewidth=0.8)
+        axis.axvline(found.goals.phase_margin_deg, color=RED, linewidth=0.8)
         axis.set_yscale("log")
         axis.set_ylim(0.3, 30.0)
         axis.set_xmargin(0.03)

@@ -11,6 +11,7 @@ import tomlkit
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.gains import (
     SENSITIVITY,
+    STICKY,
     Intervals,
     LEAST_LATE_s,
     PHASE_MARGIN_deg,
@@ -43,6 +44,19 @@ def fit_of(inertia: float, late_s: float, link: float = 0.0, stiffness: float = 
 
 def known(config: Config, fit: JointFit) -> Config:
     return with_values(config, values_of_fit(config, fit, "test"))
+
+
+def test_a_rigid_joint_that_friction_rules_gets_a_stiffer_loop_that_passes_the_gate() -> None:
+    config = known(shipped("precise"), fit_of(0.15, 2e-3))
+    within = Intervals(0.36, 0.45e-3)
+    usual, sticky = (choose_gains(config, replace(within, friction_radps2=f), "precise") for f in (45.0, 70.0))
+    between = choose_gains(config, replace(within, friction_radps2=57.5), "precise")
+    assert sticky.missed == {}
+    assert usual.best.settings.kv < between.best.settings.kv < sticky.best.settings.kv
+    assert sticky.best.settings.kv > 1.4 * usual.best.settings.kv
+    assert (sticky.goals.phase_margin_deg, sticky.goals.gain_margin, sticky.goals.sensitivity) == STICKY
+    assert margins(loop_settings(changed(config, control=sticky.control))[0]).phase_margin_deg >= 30.0
+    assert choose_gains(config, within, "precise").control == usual.control
 
 
 @pytest.mark.parametrize(("law", "late_s"), [("precise", 1.5e-3), ("precise", 2.8e-3), ("paper", 2.0e-3)])
