@@ -193,7 +193,7 @@ class CanopenDrive:
 
         Nothing is sent before the bus was silent for LISTEN_S, no NMT command before the drive is known to be off.
         """
-        with self._blamed():
+        with self._blamed("during commissioning"):
             self._started = False
             self._objects.remarks.clear()
             self._listen()
@@ -208,12 +208,12 @@ class CanopenDrive:
             self._remarks = [*([braked] if braked else []), *remarks]
 
     @contextlib.contextmanager
-    def _blamed(self) -> Iterator[None]:
-        """What goes wrong in commissioning, with another controller as its cause where there is one."""
+    def _blamed(self, when: str) -> Iterator[None]:
+        """What goes wrong, with another controller as its cause where there is one."""
         try:
             yield
         except can.CanError as error:
-            raise BusError(f"the bus failed during commissioning: {error}") from None
+            raise BusError(f"the bus failed {when}: {error}") from None
         except (DeviceError, NoDeviceError):
             self._others.refuse()  # explains it
             raise
@@ -223,7 +223,7 @@ class CanopenDrive:
         if self._remarks is None:
             self.take_over(approve)
         angle_rad = joint_angle_per_count_rad(self._settings)
-        with self._blamed():
+        with self._blamed("during commissioning"):
             remarks, self._remarks = self._remarks or [], None
             self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
             if self._reads is None:
@@ -274,7 +274,7 @@ class CanopenDrive:
         """The first part of `start_cyclic`: of an arm, all drives go through it before the first one is started."""
         if self._findings is None or self._reads is None:
             raise DeviceError("the drive has not been commissioned")
-        with self._blamed_before_run():
+        with self._blamed("before the run"):
             self._objects.verify_again()
             self._require_mode(self._findings.mode)
             self._encoder.verify_again()
@@ -282,21 +282,11 @@ class CanopenDrive:
             self._others.refuse()
             self._gate()
 
-    @contextlib.contextmanager
-    def _blamed_before_run(self) -> Iterator[None]:
-        try:
-            yield
-        except can.CanError as error:
-            raise BusError(f"the bus failed before the run: {error}") from None
-        except (DeviceError, NoDeviceError):
-            self._others.refuse()
-            raise
-
     def _start(self) -> None:
         """The second part of `start_cyclic`, for a drive that was verified."""
         assert self._findings is not None
         assert self._reads is not None
-        with self._blamed_before_run():
+        with self._blamed("before the run"):
             self._started = True
             self._encoder.send_command(NmtCommand.START)
             self._node.nmt.send_command(NmtCommand.START)

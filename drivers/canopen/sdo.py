@@ -220,21 +220,19 @@ class ObjectAccess:
 
     def read_if_present(self, index: int, sub: int = 0, *, what: str) -> int | None:
         """`read` where EDS and drive have the object; None where one has not."""
+        return self._if_present(index, sub, lambda: self.read(index, sub, what=what))
+
+    def _if_present(self, index: int, sub: int, transfer: Callable[[], int]) -> int | None:
+        """What `transfer` gives; None where EDS or drive lack the object, which is asked for no more then."""
         if self._variable(index, sub) is None or not self._answered.get((index, sub), True):
             return None
         try:
-            return self.read(index, sub, what=what)
+            return transfer()
         except DeviceError as error:
-            if self._says_absent(error, index, sub):
-                return None
-            raise
-
-    def _says_absent(self, error: DeviceError, index: int, sub: int) -> bool:
-        """Whether the drive has refused because it lacks the object; that is kept."""
-        absent = isinstance(error.__cause__, SdoAbortedError) and error.__cause__.code in ABSENT
-        if absent:
+            if not (isinstance(error.__cause__, SdoAbortedError) and error.__cause__.code in ABSENT):
+                raise
             self._answered[index, sub] = False
-        return absent
+            return None
 
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
@@ -325,15 +323,7 @@ class ObjectAccess:
 
     def write_if_present(self, index: int, sub: int, value: int, *, what: str) -> bool:
         """`write_verified` where EDS and drive have the object; False where one has not."""
-        if self._variable(index, sub) is None or not self._answered.get((index, sub), True):
-            return False
-        try:
-            self.write_verified(index, sub, value, what=what)
-        except DeviceError as error:
-            if self._says_absent(error, index, sub):
-                return False
-            raise
-        return True
+        return self._if_present(index, sub, lambda: self.write_verified(index, sub, value, what=what)) is not None
 
     def text(self, index: int) -> str:
         """A visible string such as 1008 (device name); empty if there is none."""

@@ -402,7 +402,6 @@ class Dialogue:
         self._timeout_s = timeout_s
         self._clock = clock
         self.interpreter = Interpreter()
-        self.retries = 0
         self.gate: Callable[[], None] = lambda: None  # raises where no more is to be sent to the drive
         self._verified: dict[tuple[str, int | None], float] = {}  # what `assign_verified` read back last
 
@@ -437,7 +436,6 @@ class Dialogue:
         for attempt in range(attempts):
             self.gate()
             if attempt:
-                self.retries += 1
                 self.resynchronise()
             reply = self.once(command)
             if reply.kind is ReplyKind.VALUE:

@@ -78,7 +78,7 @@ def _enough(settings: LoopSettings, minimum_deg: float) -> bool:
 
 
 def _search(
-    settings: LoopSettings, minimum_deg: float, start: float, end: float, change: Callable[[float], LoopSettings]
+    minimum_deg: float, start: float, end: float, change: Callable[[float], LoopSettings]
 ) -> tuple[float, LoopSettings, float] | None:
     """(value, settings, phase margin) nearest to `start` on the way to `end` (both > 0, a scan by ratio)."""
 
@@ -118,29 +118,27 @@ def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
 
     highest = _HIGHEST_CUTOFF / s.period_s
     if 0.0 < s.cutoff_Hz < highest:
-        result = _search(s, minimum_deg, s.cutoff_Hz, highest, lambda v: replace(s, cutoff_Hz=v))
+        result = _search(minimum_deg, s.cutoff_Hz, highest, lambda v: replace(s, cutoff_Hz=v))
         add(f"control.velocity_cutoff_Hz = {{value:g}} (now {s.cutoff_Hz:g})", result)
     if network:
         q1, q2 = s.q
         if q1 == q2:
-            result = _search(s, minimum_deg, q1, q1 * 1e-3, lambda v: replace(s, q=(v, v)))
+            result = _search(minimum_deg, q1, q1 * 1e-3, lambda v: replace(s, q=(v, v)))
             add(f"control.lyapunov_q = {{value:g}} (now {q1:g}; adaptation in proportion)", result)
-        result = _search(s, minimum_deg, s.learning_rate, s.learning_rate * 1e-3, lambda v: replace(s, learning_rate=v))
+        result = _search(minimum_deg, s.learning_rate, s.learning_rate * 1e-3, lambda v: replace(s, learning_rate=v))
         add(f"control.learning_rate = {{value:g}} (now {s.learning_rate:g})", result)
     if s.kind == ControllerKind.PID and s.ki > 0.0:
-        result = _search(s, minimum_deg, s.ki, s.ki * 1e-3, lambda v: replace(s, ki=v))
+        result = _search(minimum_deg, s.ki, s.ki * 1e-3, lambda v: replace(s, ki=v))
         add(f"control.ki = {{value:g}} (now {s.ki:g})", result)
     if s.kind in OBSERVING and s.observer_radps > 0.0:
-        result = _search(
-            s, minimum_deg, s.observer_radps, s.observer_radps * 1e-3, lambda v: replace(s, observer_radps=v)
-        )
+        result = _search(minimum_deg, s.observer_radps, s.observer_radps * 1e-3, lambda v: replace(s, observer_radps=v))
         add(f"control.observer_radps = {{value:g}} (now {s.observer_radps:g})", result)
-    result = _search(s, minimum_deg, s.kv, s.kv * 6.0, lambda v: replace(s, kv=v))
+    result = _search(minimum_deg, s.kv, s.kv * 6.0, lambda v: replace(s, kv=v))
     add(f"control.kv = {{value:g}} (now {s.kv:g})", result)
     if result is None:
-        result = _search(s, minimum_deg, s.kv, s.kv / 6.0, lambda v: replace(s, kv=v))
+        result = _search(minimum_deg, s.kv, s.kv / 6.0, lambda v: replace(s, kv=v))
         add(f"control.kv = {{value:g}} (now {s.kv:g})", result)
-    result = _search(s, minimum_deg, 1.0, 0.03, lambda v: slower(s, v))
+    result = _search(minimum_deg, 1.0, 0.03, lambda v: slower(s, v))
     add("a slower loop: control.kp = {changed.kp:.4g}, kv = {changed.kv:.4g}" + _rest_text(s, network), result)
     return found
 

@@ -190,6 +190,15 @@ def first_on_bus(joints: Iterable[Config]) -> list[int]:
     return [places.index(place) for place in places]
 
 
+def refuse_shipped(config: Config) -> None:
+    """`ConfigurationError` for a file that is to be written into and came with jointctl."""
+    if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
+        raise ConfigurationError(
+            f"{config.path.name} is a shipped configuration and is not changed",
+            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
+        )
+
+
 def beside(config_path: Path, name: str) -> Path:
     """A file that a configuration names: beside it, else a shipped one."""
     own = config_path.parent / name

@@ -21,7 +21,6 @@ from jointctl.tools.identification.models import FORMS, Branch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # --- tables ---
 
@@ -154,81 +153,70 @@ def fit_figure(
     With `identified` the 95 % band is drawn, and the weak parameters are named.
     """
     with canvas(9.6) as figure:
-        _paint_fit(figure, data, branches, used, outliers, identified)
-        figure.axes[0].set_title(title, fontsize=12, fontweight="bold")
-        return figure
-
-
-def _paint_fit(
-    figure: Figure,
-    data: FrictionData,
-    branches: dict[str, Branch],
-    used: dict[str, np.ndarray],
-    outliers: np.ndarray | None,
-    identified: Identification | None,
-) -> None:
-    axes = figure.subplots(3, 1, sharex=True, height_ratios=(4, 2, 2))
-    unsettled = np.flatnonzero(~data.settled)
-    _points(axes[0], data, np.concatenate(list(used.values())), "measured", BLUE, "o")
-    worst = 0.0
-    for word, sign in DIRECTIONS:
-        if word not in used or not len(used[word]):
-            continue
-        found, chosen = branches[word], used[word]
-        speeds = _curve_speeds(found)
-        curve = sign * found.torque_Nm(speeds)
-        label = "model" if sign > 0 else None
-        axes[0].plot(sign * speeds / DEGREE, curve, color=ORANGE, linewidth=1.8, label=label, zorder=3)
-        if identified is not None:
-            direction = identified.directions[word]
-            inside = speeds[speeds >= direction.fit.problem.x[0] * found.max_radps]
-            ends = direction.uncertainty.band_Nm(direction.fit, inside / direction.fit.problem.top_radps)
-            low, high = (1e3 * sign * (end - found.torque_Nm(inside)) for end in ends)
-            axes[1].fill_between(
-                sign * inside / DEGREE, low, high, color=ORANGE, alpha=0.3, linewidth=0.0,
-                label="95 % band of the curve" if sign > 0 else None, zorder=1,
-            )  # fmt: skip
-        velocity = data.velocity_radps[chosen]
-        error = data.motor_torque_Nm[chosen] - sign * found.torque_Nm(np.abs(velocity))
-        relative = 100.0 * np.abs(relative_errors(error, data.motor_torque_Nm[chosen]))
-        there = relative[np.isfinite(relative)]
-        # one point near zero torque must not flatten all the others
-        if len(there):
-            worst = max(worst, min(float(there.max()), 2.0 * float(np.percentile(there, 99))))
-        axes[1].vlines(velocity / DEGREE, 0.0, 1e3 * error, color=BLUE, linewidth=0.7, alpha=0.5)
-        axes[1].plot(velocity / DEGREE, 1e3 * error, "o", color=BLUE, markersize=2.6)
-        axes[2].plot(velocity / DEGREE, relative, "o", color=BLUE, markersize=2.6)
-        axes[2].vlines(velocity / DEGREE, 0.0, relative, color=BLUE, linewidth=0.7, alpha=0.5)
-    if outliers is not None and len(outliers):
-        _points(axes[0], data, outliers, "outlier, not used", RED, "x")
-    if len(unsettled):
-        _points(axes[0], data, unsettled, "never settled, not used", GREY, "^")
-    for axis in axes[1:]:
-        axis.axhline(0.0, color=GREY, linewidth=0.8)
-    axes[0].set_ylabel("friction at the motor [Nm]")
-    axes[1].set_ylabel("measured - model [mNm]")
-    axes[2].set_ylabel("relative error [%]")
-    axes[2].set_ylim(0.0, 1.08 * worst if worst > 0.0 else 1.0)
-    axes[2].set_xlabel("joint velocity [deg/s]")
-    ratio = data.reduction_ratio
-    joint = axes[0].secondary_yaxis("right", functions=(lambda y: y * ratio, lambda y: y / ratio))
-    joint.set_ylabel("at the joint [Nm]")
-    joint.grid(False)
-    joint.spines["right"].set_visible(True)
-    for axis in axes:
+        axes = figure.subplots(3, 1, sharex=True, height_ratios=(4, 2, 2))
+        unsettled = np.flatnonzero(~data.settled)
+        _points(axes[0], data, np.concatenate(list(used.values())), "measured", BLUE, "o")
+        worst = 0.0
         for word, sign in DIRECTIONS:
-            found = branches[word]
-            if found.knee_radps < found.max_radps:
-                axis.axvline(sign * found.knee_radps / DEGREE, color=GREY, linewidth=0.8, linestyle=":", zorder=0)
-        axis.set_xmargin(0.02)
-    axes[0].legend(loc="upper left")
-    if identified is not None:
-        axes[1].legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0))
-    axes[0].text(
-        0.99, 0.04, _summary_text(data, branches, used), transform=axes[0].transAxes, ha="right", va="bottom",
-        fontsize=9, color=GREY,
-    )  # fmt: skip
-    figure.align_ylabels(axes)
+            if word not in used or not len(used[word]):
+                continue
+            found, chosen = branches[word], used[word]
+            speeds = _curve_speeds(found)
+            curve = sign * found.torque_Nm(speeds)
+            label = "model" if sign > 0 else None
+            axes[0].plot(sign * speeds / DEGREE, curve, color=ORANGE, linewidth=1.8, label=label, zorder=3)
+            if identified is not None:
+                direction = identified.directions[word]
+                inside = speeds[speeds >= direction.fit.problem.x[0] * found.max_radps]
+                ends = direction.uncertainty.band_Nm(direction.fit, inside / direction.fit.problem.top_radps)
+                low, high = (1e3 * sign * (end - found.torque_Nm(inside)) for end in ends)
+                axes[1].fill_between(
+                    sign * inside / DEGREE, low, high, color=ORANGE, alpha=0.3, linewidth=0.0,
+                    label="95 % band of the curve" if sign > 0 else None, zorder=1,
+                )  # fmt: skip
+            velocity = data.velocity_radps[chosen]
+            error = data.motor_torque_Nm[chosen] - sign * found.torque_Nm(np.abs(velocity))
+            relative = 100.0 * np.abs(relative_errors(error, data.motor_torque_Nm[chosen]))
+            there = relative[np.isfinite(relative)]
+            # one point near zero torque must not flatten all the others
+            if len(there):
+                worst = max(worst, min(float(there.max()), 2.0 * float(np.percentile(there, 99))))
+            axes[1].vlines(velocity / DEGREE, 0.0, 1e3 * error, color=BLUE, linewidth=0.7, alpha=0.5)
+            axes[1].plot(velocity / DEGREE, 1e3 * error, "o", color=BLUE, markersize=2.6)
+            axes[2].plot(velocity / DEGREE, relative, "o", color=BLUE, markersize=2.6)
+            axes[2].vlines(velocity / DEGREE, 0.0, relative, color=BLUE, linewidth=0.7, alpha=0.5)
+        if outliers is not None and len(outliers):
+            _points(axes[0], data, outliers, "outlier, not used", RED, "x")
+        if len(unsettled):
+            _points(axes[0], data, unsettled, "never settled, not used", GREY, "^")
+        for axis in axes[1:]:
+            axis.axhline(0.0, color=GREY, linewidth=0.8)
+        axes[0].set_ylabel("friction at the motor [Nm]")
+        axes[1].set_ylabel("measured - model [mNm]")
+        axes[2].set_ylabel("relative error [%]")
+        axes[2].set_ylim(0.0, 1.08 * worst if worst > 0.0 else 1.0)
+        axes[2].set_xlabel("joint velocity [deg/s]")
+        ratio = data.reduction_ratio
+        joint = axes[0].secondary_yaxis("right", functions=(lambda y: y * ratio, lambda y: y / ratio))
+        joint.set_ylabel("at the joint [Nm]")
+        joint.grid(False)
+        joint.spines["right"].set_visible(True)
+        for axis in axes:
+            for word, sign in DIRECTIONS:
+                found = branches[word]
+                if found.knee_radps < found.max_radps:
+                    axis.axvline(sign * found.knee_radps / DEGREE, color=GREY, linewidth=0.8, linestyle=":", zorder=0)
+            axis.set_xmargin(0.02)
+        axes[0].legend(loc="upper left")
+        if identified is not None:
+            axes[1].legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0))
+        axes[0].text(
+            0.99, 0.04, _summary_text(data, branches, used), transform=axes[0].transAxes, ha="right", va="bottom",
+            fontsize=9, color=GREY,
+        )  # fmt: skip
+        figure.align_ylabels(axes)
+        axes[0].set_title(title, fontsize=12, fontweight="bold")
+        return figure
 
 
 def _points(axis: Axes, data: FrictionData, chosen: np.ndarray, label: str, color: str, marker: str) -> None:

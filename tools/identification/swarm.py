@@ -113,6 +113,20 @@ class Weights(NamedTuple):
 
 
 @inlined
+def hermite(ends: tuple[np.ndarray, np.ndarray], t: float, column: int) -> float:
+    """Cubic between two rows of the table, `t` in [0, 1]: values in `column`, slopes four columns further."""
+    from_left, from_right = (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t), t * t * (3.0 - 2.0 * t)
+    slope_left, slope_right = t * (1.0 - t) * (1.0 - t), t * t * (t - 1.0)
+    left, right = ends
+    return (
+        from_left * left[column]
+        + from_right * right[column]
+        + slope_left * left[column + 4]
+        + slope_right * right[column + 4]
+    )
+
+
+@inlined
 def squared_error(p: np.ndarray, samples: Samples) -> float:
     """E of one particle."""
     x, y, weight, sums, table, knee = samples.x, samples.y, samples.weight, samples.sums, samples.table, samples.knee
@@ -134,33 +148,9 @@ def squared_error(p: np.ndarray, samples: Samples) -> float:
         place = (p[2] - table[0, 6]) * table[0, 7]
         node = min(max(int(place), 0), len(table) - 3)
         t = place - node
-        left, right = node + 1, node + 2
-        from_left, from_right = (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t), t * t * (3.0 - 2.0 * t)
-        slope_left, slope_right = t * (1.0 - t) * (1.0 - t), t * t * (t - 1.0)
-        e = (
-            from_left * table[left, 0]
-            + from_right * table[right, 0]
-            + slope_left * table[left, 4]
-            + slope_right * table[right, 4]
-        )
-        e_e = (
-            from_left * table[left, 1]
-            + from_right * table[right, 1]
-            + slope_left * table[left, 5]
-            + slope_right * table[right, 5]
-        )
-        e_x = (
-            from_left * table[left, 2]
-            + from_right * table[right, 2]
-            + slope_left * table[left, 6]
-            + slope_right * table[right, 6]
-        )
-        e_y = (
-            from_left * table[left, 3]
-            + from_right * table[right, 3]
-            + slope_left * table[left, 7]
-            + slope_right * table[right, 7]
-        )
+        ends = table[node + 1], table[node + 2]
+        e, e_e = hermite(ends, t, 0), hermite(ends, t, 1)
+        e_x, e_y = hermite(ends, t, 2), hermite(ends, t, 3)
         # |tc + d e + tv x - y|^2 multiplied out
         error = table[0, 5] + tc * (tc * table[0, 0] + 2.0 * (d * e + tv * table[0, 1] - table[0, 3]))
         error += d * (d * e_e + 2.0 * (tv * e_x - e_y)) + tv * (tv * table[0, 2] - 2.0 * table[0, 4])

@@ -121,8 +121,7 @@ def check_cascade(
     delay = next(a for a in loop_settings(config, delay_s)[1] if a.name == "loop delay")
     title = f"The drive closes the loop ({section.mode})"
     table = Table("quantity", "value", "note", title=title, title_justify="left")
-    for assumed in (delay,):
-        table.add_row(assumed.name, f"{assumed.value:g} {assumed.unit}", assumed.origin)
+    table.add_row(delay.name, f"{delay.value:g} {delay.unit}", delay.origin)
     with_target = section.sent_with_target(config.loop.rate_Hz)
     lead = with_target.lead_s if with_target is not None else 0.0
     table.add_row("lead", f"{lead * 1e3:g} ms", "by which the motion is sent ahead (drive.cascade.lead_s)")

@@ -127,16 +127,13 @@ def map_verb(
 ) -> int:
     """Measure kinematic error and torque ripple of the reducer: one slow motion both ways, Fourier series, picture."""
     from jointctl.tools.analysis.reducer_map import found_map, map_figure
-    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.configuration.config import refuse_shipped
     from jointctl.tools.configuration.found_values import with_map, write_changed
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.plan import require_terminal
 
-    if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
-        raise ConfigurationError(
-            f"{config.path.name} is a shipped configuration and is not changed",
-            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
-        )
+    if write:
+        refuse_shipped(config)
     if write and config.reducer is not None and config.encoder.side != "motor":
         raise ConfigurationError(
             f"{config.path}: --write makes a [reducer.map], which is of the motor's angle: encoder.side "

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
+from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
 
 LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders", "link_encoder"), ("tracking", "settling", "quiet")
@@ -53,7 +53,7 @@ def tune(
     Direction, frequency response, gravity, friction, map of the reducer, gains, a run to verify them.  An aborted tune
     leaves the file as it was.
     """
-    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.configuration.config import refuse_shipped
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.session.result import never_begun, require_off
@@ -63,11 +63,7 @@ def tune(
     for name, value, known in (("--law", options.law, LAWS), ("--objective", options.objective, OBJECTIVES)):
         if value not in known:
             raise UsageError(f"{name} (={value}) must be one of {', '.join(known)}")
-    if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
-        raise ConfigurationError(
-            f"{config.path.name} is a shipped configuration and is not changed",
-            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
-        )
+    refuse_shipped(config)
     if not (assume_yes or dry_run or options.lockstep):
         require_terminal()
     consent = ShownConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)

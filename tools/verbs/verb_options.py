@@ -256,10 +256,6 @@ def _loaded_joint_or_arm(*, config: ConfigPath, bus: BusOptions) -> Config | Arm
     return loaded_joint_or_arm(config, bus)
 
 
-def _loaded_file(config: ConfigPath) -> Config:
-    return loaded(config)
-
-
 def _loaded_file_or_arm(config: ConfigPath) -> Config | ArmConfig:
     return loaded_joint_or_arm(config)
 
@@ -282,7 +278,6 @@ def _output(json: Json = False, quiet: Quiet = False) -> Output:
 
 JointOnBus = Annotated["Config", _loaded]
 JointOrArmOnBus = Annotated["Config | ArmConfig", _loaded_joint_or_arm]
-JointOfFile = Annotated["Config", _loaded_file]
 JointOrArm = Annotated["Config | ArmConfig", _loaded_file_or_arm]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]
 ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once

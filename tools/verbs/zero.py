@@ -53,15 +53,11 @@ def zero(
     assume_yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
 ) -> int:
     """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
-    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.configuration.config import refuse_shipped
     from jointctl.tools.session.plan import agreed, require_terminal
     from jointctl.tools.written_file import refuse_read_only, replace_file
 
-    if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
-        raise ConfigurationError(
-            f"{config.path.name} is a shipped configuration and is not changed",
-            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
-        )
+    refuse_shipped(config)
     refuse_read_only(config.path)
     if not -math.tau * 100.0 <= angle_rad <= math.tau * 100.0:
         raise ConfigurationError(f"--angle (={angle_rad:g}) must be in [-628..628] rad")
