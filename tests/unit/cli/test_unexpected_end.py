@@ -150,26 +150,25 @@ STUCK = (
 )
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_during_the_imports_of_a_verb_that_moves_a_joint_a_stop_ends_it_with_one_line(number: signal.Signals) -> None:
-    started = subprocess.Popen(
-        [sys.executable, "-c", STUCK, "run", "-y"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+def ended_while_importing(number: signal.Signals, *words: str) -> tuple[int, str]:
+    """(exit code, what it said) of a verb that got this signal."""
+    command = [sys.executable, "-c", STUCK, *words]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert started.stdout is not None
     assert started.stdout.readline() == "importing\n"
     started.send_signal(number)
-    assert started.communicate(timeout=20.0)[1] == "interrupted; nothing was begun\n"
-    assert started.returncode == INTERRUPTED
+    _, said = started.communicate(timeout=20.0)
+    return started.returncode, said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_during_the_imports_of_a_verb_that_moves_a_joint_a_stop_ends_it_with_one_line(number: signal.Signals) -> None:
+    assert ended_while_importing(number, "run", "-y") == (INTERRUPTED, "interrupted; nothing was begun\n")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, -signal.SIGTERM)])
 def test_its_twin_another_verb_is_ended_by_a_signal_as_any_program(number: signal.Signals, code: int) -> None:
-    started = subprocess.Popen([sys.executable, "-c", STUCK, "check"], stdout=subprocess.PIPE, text=True)
-    assert started.stdout is not None
-    assert started.stdout.readline() == "importing\n"
-    started.send_signal(number)
-    started.communicate(timeout=20.0)
-    assert started.returncode == code
+    assert ended_while_importing(number, "check")[0] == code
 
 
 @pytest.mark.parametrize("by", ["", " by jointctl stop"])

@@ -137,39 +137,41 @@ def follow(law_c, law_s, plant_c, plant_s, reference, amplitude_rad, omega_radps
         step_plant(plant_c, plant_s, torque)
 
 
+def astray_rad(
+    law: Any, state: Any, amplitude_rad: float = 0.3, frequency_Hz: float = 0.7, snap_share: float = 1.0, late: int = 0
+) -> float:
+    """How far motor or link get from where they should be in half a second; `late`: steps by which the torque is."""
+    c, s = flexible_plant()
+    errors = np.zeros((round(0.5 / 50e-6), 2))
+    motion = amplitude_rad, math.tau * frequency_Hz, snap_share
+    follow(law[0], state[0], c[0], s[0], new(Reference)[0], *motion, errors, np.zeros(late))
+    return float(np.max(np.abs(errors)))
+
+
 @pytest.mark.parametrize("frequency_Hz", [0.2, 0.7])
 def test_the_feed_forward_alone_moves_the_link_as_desired(frequency_Hz: float) -> None:
     """Nothing damps here: an error of sign or of size in any of the terms would ring on."""
-    (law, state), (c, s) = flexible_law(), flexible_plant()
-    errors = np.zeros((round(0.5 / 50e-6), 2))
-    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * frequency_Hz, 1.0, errors, np.zeros(0))
     # the twist is up to 1 mrad here, the kinematic error 0.14 mrad
-    assert np.max(np.abs(errors)) < 3e-5
+    assert astray_rad(*flexible_law(), frequency_Hz=frequency_Hz) < 3e-5
 
 
 @pytest.mark.parametrize(
     "left_out", ["link_inertia_kgm2", "compliance_radpNm", "kinematic_error", "torque_ripple", "gravity_Nm"]
 )
 def test_each_term_of_the_feed_forward_is_needed(left_out: str) -> None:
-    (law, state), (c, s) = flexible_law(), flexible_plant()
-    errors, flexible = np.zeros((round(0.5 / 50e-6), 2)), law[0].flexible
+    law, state = flexible_law()
+    flexible = law[0].flexible
     if left_out in ("kinematic_error", "torque_ripple"):
         flexible[left_out].count = 0
     elif left_out == "gravity_Nm":
         law[0].gravity_Nm = 0.0
     else:
         flexible[left_out] = 0.0
-    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors, np.zeros(0))
-    assert np.max(np.abs(errors)) > 6e-5
+    assert astray_rad(law, state) > 6e-5
 
 
 def test_a_quick_motion_needs_its_fourth_derivative() -> None:
-    found = []
-    for snap_share in (1.0, 0.0):
-        (law, state), (c, s) = flexible_law(), flexible_plant()
-        errors = np.zeros((round(0.5 / 50e-6), 2))
-        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.05, math.tau * 3.0, snap_share, errors, np.zeros(0))
-        found.append(float(np.max(np.abs(errors))))
+    found = [astray_rad(*flexible_law(), 0.05, 3.0, snap_share) for snap_share in (1.0, 0.0)]
     assert found[0] < 0.3 * found[1]
 
 
@@ -177,12 +179,9 @@ def test_the_feed_forward_leads_by_as_much_as_the_torque_is_late() -> None:
     """Torsion and kinematic error included; what the readings are compared with does not lead."""
     late_steps, found = 24, []
     for lead_s in (late_steps * 50e-6, 0.0):
-        (law, state), (c, s) = flexible_law(), flexible_plant()
+        law, state = flexible_law()
         law[0].feed_forward_lead_s = lead_s
-        errors = np.zeros((round(0.5 / 50e-6), 2))
-        late = np.zeros(late_steps)
-        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors, late)
-        found.append(float(np.max(np.abs(errors))))
+        found.append(astray_rad(law, state, late=late_steps))
     assert found[0] < 0.2 * found[1]
 
 

@@ -520,11 +520,17 @@ def test_a_run_that_hangs_altogether_is_ended_and_its_drive_reached(world: Guard
     assert caller.makefile().read().splitlines()[-1] == json.dumps({"state": "off"})
 
 
-@pytest.mark.parametrize("said", [b"nonsense\n", b"[1]\n", b'"stop"\n', b"", b'{"ask": "stop"' + 5000 * b" "])
-def test_nonsense_is_not_answered_and_stops_nothing(
-    world: Guarded, monkeypatch: pytest.MonkeyPatch, said: bytes
+@pytest.mark.parametrize(
+    ("said", "may_ask"),
+    [(b"nonsense\n", True), (b"[1]\n", True), (b'"stop"\n', True), (b"", True), (b'{"ask": "stop"' + 5000 * b" ", True),
+     (b'{"ask": "stop"}\n', False)],
+)  # fmt: skip
+def test_nonsense_and_another_user_are_not_answered_and_stop_nothing(
+    world: Guarded, monkeypatch: pytest.MonkeyPatch, said: bytes, may_ask: bool
 ) -> None:
     monkeypatch.setattr(elmo_guard, "HEARD_S", 0.02)
+    if not may_ask:
+        monkeypatch.setattr(elmo_guard, "may_ask", lambda peer: False)
     caller = world.call(said)
     world.after(1.0, lambda: world.say({"state": "off"}))
     assert world.run() == 0
@@ -543,16 +549,6 @@ def test_who_asks_anything_else_is_told_whose_the_line_is(world: Guarded, ask: s
     assert answered == [json.dumps({"supervisor_pid": SUPERVISOR_PID}) + "\n"]
     assert (world.words[Word.STOP], world.signals) == (StopRequest.NONE, [])
     assert world.guard._callers == []
-
-
-def test_another_user_is_not_answered(world: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(elmo_guard, "may_ask", lambda peer: False)
-    caller = world.call(b'{"ask": "stop"}\n')
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
-    assert world.words[Word.STOP] == StopRequest.NONE
-    with contextlib.suppress(ConnectionResetError):
-        assert caller.recv(100) == b""
 
 
 def test_a_caller_who_has_gone_holds_nobody_up(world: Guarded) -> None:
