@@ -21,7 +21,7 @@ PROGRAM = next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
 def free_port() -> int:
-    """For a page to be served at."""
+    """For a server on this computer."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import socket
 import struct
 import time
 from collections import deque
@@ -17,13 +16,6 @@ import websockets.sync.client as websockets
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE, TIME, RESPONSE = 1, 2, 3  # first byte of what the server sends in binary
 PUBLISH, CALL = 1, 2  # and of what a client does
-
-
-def free_port() -> int:
-    """For a server on this computer."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class FoxgloveClient:

@@ -1,11 +1,16 @@
-"""What a command leaves; Python code in a process of its own, which must end well."""
+"""Beside other processes: what a command leaves, Python code that must end well, waiting."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -38,3 +43,12 @@ def run_python(code: str, *arguments: str, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
+
+
+def eventually(condition: Callable[[], _T], within_s: float = 10.0, shown: Callable[[], object] = lambda: "") -> _T:
+    """What `condition` gives when it holds at last; a test that waits for ever fails with what is `shown`."""
+    give_up_s = time.monotonic() + within_s
+    while not (found := condition()):
+        assert time.monotonic() < give_up_s, shown()
+        time.sleep(0.005)
+    return found

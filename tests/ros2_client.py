@@ -16,6 +16,8 @@ import zenoh
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from zenoh.ext import Int64, UInt8, z_deserialize, z_serialize
 
+from tests.python_process import eventually
+
 _TIME = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 _HEADER = f"MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n{'=' * 80}\n{_TIME}"
 _LINE = "=" * 80 + "\n"
@@ -67,10 +69,7 @@ class Ros2Client:
         self.session, self.domain, self.name = zenoh.open(config), domain, name
         self._gid, self._sent = bytes(range(16)), 0
         self.commands = "/joint/command"
-        give_up_s = time.monotonic() + timeout_s
-        while not list(self.session.info.peers_zid()):
-            assert time.monotonic() < give_up_s
-            time.sleep(0.02)
+        eventually(lambda: list(self.session.info.peers_zid()), timeout_s)
 
     def tokens(self) -> list[str]:
         """Everything that is in the graph."""

@@ -33,7 +33,7 @@ import typer
 import jointctl
 from jointctl.tools.output import Output
 from tests.bench.paired import Row, conditions, measured, outcome_data, outcome_table
-from tests.foxglove_client import free_port
+from tests.browser import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUP = "client"

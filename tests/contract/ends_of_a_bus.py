@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -16,6 +14,7 @@ from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.canopen.exchange import receive_frame, send_frame
 from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import new
+from tests.python_process import eventually
 
 LONG_S = 10.0  # far more than is ever needed: a limit against hanging, not a measure of speed
 SHORT_S = 0.05
@@ -88,14 +87,4 @@ class PythonCanEnd:
 
 
 def send_surely(end: End, identifier: int, data: bytes = b"") -> None:
-    limit_s = time.monotonic() + LONG_S
-    while not end.send(identifier, data):
-        assert time.monotonic() < limit_s
-        time.sleep(0.001)
-
-
-def eventually(condition: Callable[[], bool]) -> None:
-    limit_s = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < limit_s
-        time.sleep(0.001)
+    eventually(lambda: end.send(identifier, data), LONG_S)

@@ -25,9 +25,9 @@ from tests.contract.ends_of_a_bus import (
     End,
     PythonCanEnd,
     RawEnd,
-    eventually,
     send_surely,
 )
+from tests.python_process import eventually
 
 END = (0x7AA, b"")  # the last frame of a test
 

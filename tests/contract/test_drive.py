@@ -20,6 +20,7 @@ from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.elmo import elmo_settings
 from jointctl.tools.configuration.load import load_config, moved, shipped_config
 from jointctl.tools.virtual_joint import serve_virtual_elmo
+from tests.python_process import eventually
 
 
 class Bench(Protocol):
@@ -189,10 +190,7 @@ class TestCanopenDrive(DriveContract):
         bench.drive.start_cyclic()
         meter = bench.drive.thermometer()
         assert meter is not None
-        give_up_s = time.monotonic() + 5.0
-        while (found := meter.poll()) is None:
-            assert time.monotonic() < give_up_s
-            time.sleep(0.01)
+        found = eventually(meter.poll, 5.0)
         assert (found.temperature_degC, found.problem) == (25.0, "")
         assert bench.drive.make_safe() == self.off
 

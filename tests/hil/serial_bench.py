@@ -6,8 +6,7 @@ import contextlib
 import json
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,12 +35,6 @@ class SerialBench:
     def config(self, name: str = "serial.toml", **changes: Any) -> str:
         values = {**PATIENT, "trajectory__duration_s": 20.0, "drive__port": self.device.path, **changes}
         return serial_config(self.bench.folder, name, values)
-
-    def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-        give_up_s = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < give_up_s
-            time.sleep(0.02)
 
     def standing(self) -> bool:
         """Motor off and the joint at rest."""

@@ -13,12 +13,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from jointctl.firmware_py.states import AxisPhase, Fault
-from tests.browser import PROGRAM, Browser
-from tests.foxglove_client import FoxgloveClient, free_port
+from tests.browser import PROGRAM, Browser, free_port
+from tests.foxglove_client import FoxgloveClient
 from tests.hil.test_arm_run import NAMES, ArmBench
 from tests.hil.test_foxglove import decoded
 from tests.hil.test_python_arm import PATIENT
 from tests.hil.test_scope_browser import environment, moves, printed_address, state_is
+from tests.python_process import eventually
 from tests.ros2_client import DIAGNOSTICS, JOINT_STATE, Ros2Client
 
 DOMAIN = 7
@@ -117,9 +118,7 @@ def test_a_ros_2_node_enables_leads_and_leaves_all_joints(arm: ArmBench) -> None
         client.collect("/joint_states", JOINT_STATE, lambda state, _: states.append(state))
         client.collect("/diagnostics", DIAGNOSTICS, lambda report, _: reports.append(report))
         run.saw("waiting up to")
-        give_up_s = time.monotonic() + 10.0
-        while not client.call("/arm/enable")[0]:
-            assert time.monotonic() < give_up_s
+        eventually(lambda: client.call("/arm/enable")[0])
         run.saw("  tracking")
         client.command(positions=[START_rad])  # of one joint: for nothing
         begun_s = time.monotonic()

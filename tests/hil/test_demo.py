@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import struct
-import time
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, DriveState
 from tests.hil.moving_run import gone
+from tests.python_process import eventually
 
 ROWS = (
     "tracking error", "RMSE", "wake-up late, p50/p99/p99.9/max", "work, p50/p99/p99.9/max", "skipped", "bus load",
@@ -63,10 +63,7 @@ def test_json_is_one_document_and_nothing_else(bench: Any) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_demo_that_is_killed_while_it_starts_leaves_no_process_behind(bench: Any, number: int) -> None:
     started = bench.start("demo").saw("starting the virtual joint")
-    give_up = time.monotonic() + 10.0
-    while not (children := started.children()):
-        assert time.monotonic() < give_up
-        time.sleep(0.01)
+    children = eventually(started.children)
     started.signal(number)
     started.process.wait(10.0)
     assert all(gone(pid, 120.0) for pid in children)  # the first start compiles before it looks around

@@ -17,6 +17,7 @@ import pytest
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.elmo_line import ElmoDevice
 from tests.hil.serial_bench import stick_position
+from tests.python_process import eventually
 
 
 @pytest.mark.stays("serial loop: its own end, however it comes about")
@@ -94,7 +95,7 @@ def test_faults_of_drive_and_line_end_with_the_joint_stopped(
     spoil(serial_bench.device)
     finished = run.finished()
     finished.refused(7, *words)
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
 
 
 def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion(serial_bench: Any) -> None:
@@ -104,7 +105,7 @@ def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion
     # the last torque stays applied: a push that friction does not hold ends at the drive's own limits
     device = serial_bench.device.interpreter
     device.state[0].added_load_torque_Nm = -60.0
-    serial_bench.until(lambda: not device.m.motor_on)
+    eventually(lambda: not device.m.motor_on, 20.0)
     assert device.m.motor_fault in (0x20000, 0x400000)
 
 
@@ -116,7 +117,7 @@ def test_a_drive_that_comes_back_with_another_baud_rate(serial_bench: Any) -> No
     assert "did not confirm that it is off" in finished.err
     # it has not understood a word: its own limits have stopped it by now, or the guard that goes on trying does
     serial_bench.device.baud_rate_bitps = 115_200
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
 
 
 def test_their_twins_just_inside_the_limits_do_not_end_a_run(serial_bench: Any) -> None:

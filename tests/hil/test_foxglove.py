@@ -16,7 +16,8 @@ from mcap_ros2.decoder import DecoderFactory
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault
-from tests.foxglove_client import FoxgloveClient, free_port
+from tests.browser import free_port
+from tests.foxglove_client import FoxgloveClient
 
 ENDLESS = {"trajectory__duration_s": 0.0}
 # a busy computer must not be the fault that is seen

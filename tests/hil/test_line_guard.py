@@ -21,6 +21,7 @@ import pytest
 from jointctl.tools.session.elmo_guard import guard_address, running_supervisor
 from tests.hil.moving_run import gone
 from tests.hil.serial_bench import GUARD, LOOP, guard_order
+from tests.python_process import eventually
 
 
 def tracking(serial_bench: Any, **changes: Any) -> Any:
@@ -41,7 +42,7 @@ def test_its_twin_without_a_guard_keeps_its_torque(serial_bench: Any) -> None:
     time.sleep(0.5)
     assert serial_bench.device.interpreter.m.motor_on  # what the guard is there for
     assert serial_bench.bench.run("stop", "serial.toml").code == 0
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
 
 
 @pytest.mark.stays("serial guard: loop and supervisor")
@@ -66,7 +67,7 @@ def test_a_port_that_comes_back_is_told_to_switch_off(serial_bench: Any) -> None
     serial_bench.device.plug_in()
     link.unlink()
     link.symlink_to(serial_bench.device.path)
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
 
 
 def test_stop_ends_a_run_that_has_the_port(serial_bench: Any) -> None:
@@ -83,7 +84,7 @@ def test_stop_ends_a_run_that_has_the_port(serial_bench: Any) -> None:
 def test_stop_while_the_user_is_asked(serial_bench: Any) -> None:
     leader, follower = os.openpty()
     run = serial_bench.bench.start("run", serial_bench.config(), stdin=follower).saw("Move the joint?")
-    serial_bench.until(lambda: running_supervisor(serial_bench.device.path) == run.process.pid)
+    eventually(lambda: running_supervisor(serial_bench.device.path) == run.process.pid, 20.0)
     assert serial_bench.bench.run("stop", "serial.toml").code == 0
     assert run.finished(20.0).code == 130
     assert serial_bench.standing()
@@ -103,7 +104,7 @@ def test_stop_of_a_run_that_hangs(serial_bench: Any, hung: str) -> None:
     assert (stopped.code, "the drive is off" in stopped.out) == (0, True), stopped
     assert serial_bench.standing()
     run.process.wait(20.0)
-    serial_bench.until(lambda: gone(loop))
+    eventually(lambda: gone(loop), 20.0)
 
 
 def test_stop_without_an_answer_of_the_guard(serial_bench: Any) -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from tests.hil.moving_run import gone
 from tests.hil.serial_bench import GUARD, LOOP
+from tests.python_process import eventually
 
 POLL_S = 0.001
 
@@ -34,7 +35,7 @@ def waited_s(condition: Callable[[], bool], timeout_s: float = 30.0) -> float:
 def pushing(serial_bench: Any, **changes: Any) -> Any:
     """A run whose drive applies torque against friction now."""
     run = serial_bench.bench.start("run", serial_bench.config(**changes), "-y").saw("  tracking")
-    serial_bench.until(lambda: abs(serial_bench.device.interpreter.m.torque_A) > 0.5)
+    eventually(lambda: abs(serial_bench.device.interpreter.m.torque_A) > 0.5, 20.0)
     return run
 
 
@@ -68,7 +69,7 @@ def test_torque_ends_in_time_whoever_is_killed_or_stopped(
     print(f"{taken_s:.3f} s")
     assert taken_s < at_most_s
     assert motor.torque_A == 0.0
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
     for pid in (run.process.pid, loop):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGCONT)
@@ -81,7 +82,7 @@ def test_torque_ends_in_time_whoever_is_killed_or_stopped(
         assert gone(guard)
         assert "line guard: the drive on" in run.err
     assert not motor.motor_on
-    serial_bench.until(serial_bench.standing)  # friction's bristles swing it back for a moment
+    eventually(serial_bench.standing, 20.0)  # friction's bristles swing it back for a moment
 
 
 def test_a_port_that_vanishes_is_told_at_once_and_a_port_that_comes_back_is_used_at_once(serial_bench: Any) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from typing import Any
+
+from tests.python_process import eventually
 
 
 def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(bench: Any) -> None:
@@ -35,7 +36,5 @@ def test_it_asks_and_ctrl_c_and_the_loss_of_the_watcher_end_it_safely(bench: Any
     check = bench.start("doctor", config, "--motion", "-y").saw("  tracking")
     loop = check.child("loop_process")
     os.kill(check.process.pid, signal.SIGKILL)
-    give_up_s = time.monotonic() + 20.0
-    while os.path.exists(f"/proc/{loop}") and time.monotonic() < give_up_s:
-        time.sleep(0.05)
+    eventually(lambda: not os.path.exists(f"/proc/{loop}"), 20.0)
     assert bench.disabled()

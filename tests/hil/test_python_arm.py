@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.hil.bench import processes_in
 from tests.hil.test_arm_run import NAMES, ArmBench
 from tests.hil.test_python_joint import KERNELS, RAMPED
+from tests.python_process import eventually
 
 PROGRAM = """
 import math, sys, time
@@ -127,13 +127,9 @@ def test_the_death_of_the_interpreter_ramps_all_down(arm: ArmBench) -> None:
     program = started(arm, STREAM).saw("streaming")
     program.signal(signal.SIGKILL)
     program.finished(30.0)
-    give_up_s = time.monotonic() + 20.0
-    while len(tails := list(arm.bench.folder.glob("runs/*.tail.mcap"))) < len(NAMES):
-        assert time.monotonic() < give_up_s
-        time.sleep(0.1)
-    while processes_in(arm.bench.folder):  # the loop, which writes them
-        assert time.monotonic() < give_up_s
-        time.sleep(0.05)
+    eventually(lambda: len(list(arm.bench.folder.glob("runs/*.tail.mcap"))) >= len(NAMES), 20.0)
+    eventually(lambda: not processes_in(arm.bench.folder), 20.0)  # the loop, which writes them
+    tails = list(arm.bench.folder.glob("runs/*.tail.mcap"))
     assert {path.name.split(".", 1)[1] for path in tails} == {f"{name}.tail.mcap" for name in NAMES}
     for path in tails:
         records = read_run_log(path).records

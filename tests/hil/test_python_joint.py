@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import signal
-import time
 from typing import Any
 
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault
 from tests.hil.bench import processes_in
+from tests.python_process import eventually
 
 PROGRAM = """
 import math, sys, time
@@ -134,13 +134,8 @@ def test_the_death_of_the_interpreter_ramps_down(bench: Any, number: int) -> Non
     program = started(bench, STREAM).saw("streaming")
     program.signal(number)
     program.finished(30.0)
-    give_up_s = time.monotonic() + 20.0
-    while not list(bench.folder.glob("runs/*.tail.mcap")):
-        assert time.monotonic() < give_up_s
-        time.sleep(0.1)
-    while processes_in(bench.folder):  # the loop, which writes it
-        assert time.monotonic() < give_up_s
-        time.sleep(0.05)
+    eventually(lambda: list(bench.folder.glob("runs/*.tail.mcap")), 20.0)
+    eventually(lambda: not processes_in(bench.folder), 20.0)  # the loop, which writes it
     log = bench.log()
     assert log.records.fault[-1] == Fault.SUPERVISOR_LOST
     assert log.records.phase[-1] == AxisPhase.FINISHED

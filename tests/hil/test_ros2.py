@@ -13,8 +13,9 @@ import zenoh
 
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.scoping import ros2_server
-from tests.foxglove_client import free_port
+from tests.browser import free_port
 from tests.hil.test_foxglove import WatchedRun, texts
+from tests.python_process import eventually
 from tests.ros2_client import DIAGNOSTICS, HASHES, JOINT_STATE, TRIGGER, Ros2Client, key
 
 DOMAIN = 7
@@ -39,10 +40,7 @@ def test_the_graph_the_states_and_the_diagnostics(bench: Any) -> None:
         client.collect("/joint_states", JOINT_STATE, lambda state, about: states.append((state, about)))
         other.collect("/diagnostics", DIAGNOSTICS, lambda report, _: reports.append(report))
         run.program.saw("tracking")
-        give_up_s = time.monotonic() + 20.0
-        while len(states) <= 100 or not reports or reports[-1].status[0].message != "tracking":
-            assert time.monotonic() < give_up_s
-            time.sleep(0.05)
+        eventually(lambda: len(states) > 100 and reports and reports[-1].status[0].message == "tracking", 20.0)
         parts = [token.split("/") for token in client.tokens()]
         assert client.call("/joint/stop") == (True, "STOP taken; again: quick stop")
     log = run.ended()
@@ -95,10 +93,9 @@ def test_without_allow_remote_nothing_but_stop_is_there(bench: Any) -> None:
 def enabled(run: Run, client: Ros2Client) -> None:
     """By ~/enable, which is taken once."""
     run.program.saw("waiting up to")
-    give_up_s = time.monotonic() + 10.0
-    while not (answer := client.call("/joint/enable"))[0]:
-        assert time.monotonic() < give_up_s
-    assert answer == (True, "enabling")
+    answers: list[tuple[bool, str]] = []
+    eventually(lambda: answers.append(client.call("/joint/enable")) or answers[-1][0])
+    assert answers[-1] == (True, "enabling")
     assert client.call("/joint/enable")[0] is False
     run.program.saw("tracking")
 
@@ -139,10 +136,7 @@ def test_an_approval_that_is_stopped_enables_nothing(bench: Any) -> None:
     with run.client() as client:
         client.collect("/diagnostics", DIAGNOSTICS, lambda report, _: reports.append(report))
         run.program.saw("waiting up to")
-        give_up_s = time.monotonic() + 20.0
-        while not reports:  # who is to enable it sees that it waits
-            assert time.monotonic() < give_up_s
-            time.sleep(0.05)
+        eventually(lambda: reports, 20.0)  # who is to enable it sees that it waits
         assert [(found.name, found.message) for found in reports[0].status] == [("joint: joint", ros2_server.WAITING)]
         assert client.call("/joint/stop")[0]
     ended = run.program.finished(60.0)
@@ -172,10 +166,7 @@ def test_a_router_that_starts_later_is_found(monkeypatch: pytest.MonkeyPatch) ->
         for path, value in (("mode", "router"), ("listen/endpoints", [place]), ("scouting/multicast/enabled", False)):
             config.insert_json5(path, json.dumps(value))
         with zenoh.open(config):
-            give_up_s = time.monotonic() + 20.0
-            while not list(node.info.routers_zid()):
-                assert time.monotonic() < give_up_s
-                time.sleep(0.05)
+            eventually(lambda: list(node.info.routers_zid()), 20.0)
 
 
 def test_an_endpoint_that_cannot_be_ends_the_run_before_it_begins(bench: Any) -> None:

@@ -23,6 +23,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.scoping.feed import LATE_S
 from tests.browser import PROGRAM, Browser, Tab, free_port
+from tests.python_process import eventually
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
 pytestmark = [
@@ -508,10 +509,7 @@ def test_each_stretch_of_a_long_log_can_be_seen_and_its_axes_are_named(
 
 
 def downloaded(path: Path) -> bytes:
-    give_up = time.monotonic() + 20.0
-    while not path.exists() or not path.stat().st_size:
-        assert time.monotonic() < give_up, list(path.parent.glob("*"))
-        time.sleep(0.1)
+    eventually(lambda: path.exists() and path.stat().st_size, 20.0, lambda: list(path.parent.glob("*")))
     time.sleep(0.3)  # a browser renames it when it is whole
     return path.read_bytes()
 

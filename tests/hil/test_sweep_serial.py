@@ -21,6 +21,7 @@ from jointctl.hil.elmo_line import ElmoDevice
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
 from tests.hil.serial_bench import GUARD, LOOP, stick_position
+from tests.python_process import eventually
 
 SHORT = ("--points", "2", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.29", "--warm-up", "0", "-y")
 
@@ -29,7 +30,7 @@ def jogging(serial_bench: Any) -> Any:
     """A sweep whose drive jogs at a speed that takes it out of its range if nobody ends it."""
     run = serial_bench.bench.start("sweep", serial_bench.config(), "-o", "data.csv", *SHORT)
     run.saw("  tracking")
-    serial_bench.until(lambda: abs(serial_bench.device.interpreter.speed_cps()) > 15_000)
+    eventually(lambda: abs(serial_bench.device.interpreter.speed_cps()) > 15_000, 20.0)
     return run
 
 
@@ -66,9 +67,9 @@ def test_loop_and_supervisor_killed_the_guard_ends_the_jog(serial_bench: Any) ->
     run.signal(signal.SIGKILL)
     os.kill(loop, signal.SIGKILL)
     began_s = time.monotonic()
-    serial_bench.until(lambda: not serial_bench.device.interpreter.m.motor_on)
+    eventually(lambda: not serial_bench.device.interpreter.m.motor_on, 20.0)
     assert time.monotonic() - began_s < 1.0
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
     device = serial_bench.device.interpreter
     assert (device.m.motor_fault, device.jog_cps) == (0, 0.0)
 
@@ -79,14 +80,14 @@ def test_its_twin_without_a_guard_jogs_on_to_the_drives_own_position_limit(seria
     os.kill(run.child(GUARD), signal.SIGKILL)
     run.saw("the guard of the line has ended")
     device = serial_bench.device.interpreter
-    serial_bench.until(lambda: abs(device.m.jog_cps) > 15_000)
+    eventually(lambda: abs(device.m.jog_cps) > 15_000, 20.0)
     os.kill(loop, signal.SIGSTOP)
     run.signal(signal.SIGKILL)
     os.kill(loop, signal.SIGKILL)
     time.sleep(0.5)
     assert device.m.motor_on
     assert abs(device.speed_cps()) > 10_000
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
     assert device.m.motor_fault == MF_POSITION_LIMIT
 
 
@@ -104,7 +105,7 @@ def test_faults_end_with_the_joint_stopped(serial_bench: Any, spoil: Callable[[E
     run = jogging(serial_bench)
     spoil(serial_bench.device)
     run.finished().refused(7, words)
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
     assert serial_bench.device.interpreter.m.motor_fault != MF_POSITION_LIMIT
 
 
@@ -115,7 +116,7 @@ def test_an_unplugged_port_is_told_and_the_drives_own_position_limit_ends_the_jo
     device = serial_bench.device.interpreter
     assert device.m.motor_on  # told while it still moves
     run.finished().refused(7, "BUS_ERROR")
-    serial_bench.until(serial_bench.standing)
+    eventually(serial_bench.standing, 20.0)
     assert device.m.motor_fault == MF_POSITION_LIMIT
 
 
@@ -123,7 +124,7 @@ def test_an_unplugged_port_keeps_the_measured_rows(serial_bench: Any) -> None:
     points = ("--points", "4", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.27", "--warm-up", "0", "-y")
     data = serial_bench.bench.folder / "data.csv"
     run = serial_bench.bench.start("sweep", serial_bench.config(), "-o", data.name, *points).saw("  tracking")
-    serial_bench.until(lambda: data.read_text().count("\n") > 1, 60.0)
+    eventually(lambda: data.read_text().count("\n") > 1, 60.0)
     serial_bench.device.vanish()
     ended = run.finished()
     kept = data.read_text().splitlines()

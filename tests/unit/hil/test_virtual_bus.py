@@ -7,8 +7,6 @@ import stat
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +37,7 @@ from jointctl.hil.virtual_bus import (
     default_socket_path,
     remove_dead_sockets,
 )
+from tests.python_process import eventually
 
 # --- Exact frame lengths and the arbitration of the virtual bus, with the time as an argument ---
 STANDARD_BITS, EXTENDED_BITS = 47, 67  # of a frame without data and stuff bits, interframe space included
@@ -204,13 +203,6 @@ def assert_passes_frames(path: Path) -> None:
     with join(path) as a, join(path) as b:
         a.send(FRAME)
         assert b.recv(64) == FRAME
-
-
-def eventually(condition: Callable[[], bool]) -> None:
-    limit_s = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < limit_s
-        time.sleep(0.001)
 
 
 def test_counters(path: Path) -> None:

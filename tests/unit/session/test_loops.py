@@ -40,6 +40,7 @@ from jointctl.tools.verbs import verb_options
 from jointctl.tools.verbs.verb_options import VerbOutput, grouped
 from tests.configurations import changed
 from tests.places import CONFIGS, ROOT
+from tests.python_process import eventually
 from tests.sessions import constants_of
 
 
@@ -224,10 +225,7 @@ def test_the_processor_time_of_a_process_grows_with_its_work(monkeypatch: pytest
     if not mounted:
         monkeypatch.setattr(Path, "read_text", not_there)
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    give_up_s = time.monotonic() + 30.0
-    while processor_time_s(process.pid) < 0.1:
-        assert time.monotonic() < give_up_s
-        time.sleep(0.05)
+    eventually(lambda: processor_time_s(process.pid) >= 0.1, 30.0)
     process.kill()
     process.wait()
     assert processor_time_s(process.pid) == 0.0
@@ -319,10 +317,7 @@ def test_a_run_that_is_killed_releases_it(stand_in: Path) -> None:
         assert "released" not in log_of(stand_in)
         run.send_signal(signal.SIGKILL)
         run.wait()
-    until_s = time.monotonic() + 10.0
-    while "released" not in log_of(stand_in):
-        assert time.monotonic() < until_s
-        time.sleep(0.02)
+    eventually(lambda: "released" in log_of(stand_in))
 
 
 # --- Opening the drive of a configuration: what fails leaves the bus to the next one that tries ---
