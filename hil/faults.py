@@ -94,7 +94,6 @@ class FaultMemory:
     random: u8  # xorshift64, never 0
     was_active: Annotated[np.ndarray, array_of(i4, MAX_FAULTS)]
     late_count: i4
-    late_lost: i8
     late_due_ns: Annotated[np.ndarray, array_of(i8, LATE_FRAMES)]  # 0 = after the next frame of this direction
     late_to_drive: Annotated[np.ndarray, array_of(i4, LATE_FRAMES)]
     late_frames: Annotated[np.ndarray, array_of(u1, LATE_FRAMES, FRAME_SIZE)]
@@ -240,7 +239,6 @@ def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
     """Copy a frame to the end of a queue; its slot, or -1 when full."""
     slot = int64(queue.count)
     if slot >= QUEUE_LENGTH:
-        queue.overflowed += 1
         return -1
     for i in range(FRAME_SIZE):
         queue.frames[slot, i] = frame[i]
@@ -259,7 +257,6 @@ def _unstamp(frame: np.ndarray) -> None:
 def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -> None:
     slot = int64(memory.late_count)
     if slot >= LATE_FRAMES:
-        memory.late_lost += 1
         return
     memory.late_due_ns[slot] = due_ns
     memory.late_to_drive[slot] = 1 if to_drive else 0

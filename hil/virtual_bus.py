@@ -68,7 +68,6 @@ class FrameQueue:
     """Frames waiting to be sent, in order; `count` of them are valid."""
 
     count: i4
-    overflowed: i4
     frames: Annotated[np.ndarray, array_of(u1, QUEUE_LENGTH, FRAME_SIZE)]
 
 

@@ -42,10 +42,9 @@ LENGTH_ERRORS = 0x1F00  # reported, but no reason to keep a fault
 
 @kernel
 def push_frame(queue: FrameQueue, identifier: int, size: int) -> int:
-    """Append a frame with `size` zero bytes of data; its slot, or -1 (and `overflowed` counts) when full."""
+    """Append a frame with `size` zero bytes of data; its slot, or -1 when full."""
     slot = int64(queue.count)
     if slot >= QUEUE_LENGTH:
-        queue.overflowed += 1
         return -1
     for i in range(16):
         queue.frames[slot, i] = 0
@@ -328,7 +327,7 @@ def _command_homing(device: Device, word: int, last: int) -> None:
 
 
 @kernel
-def _command_enabled(device: Device, word: int, command: int) -> None:
+def _command_enabled(device: Device, command: int) -> None:
     """Operation Enabled: the ways out of it, and its resumption while a stop ramp of 605B or 605C runs."""
     if command == 0x07 and device.braking == 0:
         begin_stop(device, int64(device.drive.disable_option), PowerState.SWITCHED_ON)
@@ -380,7 +379,7 @@ def apply_controlword(device: Device, queue: FrameQueue) -> None:
         else:
             device.state = PowerState.READY_TO_SWITCH_ON
     elif state == PowerState.OPERATION_ENABLED:
-        _command_enabled(device, word, command)
+        _command_enabled(device, command)
         if drive.mode_display == Mode.PROFILE_POSITION and command == 0x0F:
             _take_setpoint(device, word, last)
         elif drive.mode_display == Mode.HOMING and command == 0x0F:

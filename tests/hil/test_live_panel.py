@@ -142,7 +142,7 @@ def test_a_terminal_that_takes_it_gets_the_panel() -> None:
 
 def test_lines_where_there_is_no_terminal() -> None:
     for options in ({}, {"json": True}, {"quiet": True}):
-        display = run_display(Output(stderr=io.StringIO(), **options), "t")()
+        display = run_display(Output(stderr=io.StringIO(), **options), "t")(None)
         assert isinstance(display, PhaseLines)
     out = io.StringIO()
     with PhaseLines(Output(stderr=out)) as display:

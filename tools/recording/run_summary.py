@@ -78,7 +78,7 @@ class RunSummary:
     tracked_s: float
     fault: str
     error: ErrorSummary | None
-    late_error: ErrorSummary | None  # after `late_from_s`, by default the second half
+    late_error: ErrorSummary | None  # in the second half
     settling_s: float | None  # from then on |e| stays within 1 mrad; None = never
     command_torque_Nm: Range | None
     measured_torque_Nm: Range | None
@@ -101,21 +101,19 @@ def summarise(
     records: np.ndarray,
     histograms: np.ndarray | None = None,
     *,
-    late_from_s: float | None = None,
     temperatures_degC: Sequence[float] | np.ndarray = (),
 ) -> RunSummary:
     """Summary of `records` (array of LogRecord, shape (N,)).
 
     `histograms` int64[4, bins of 1 us], rows as of `Histogram`, the last bin open: where given, the deadline
     statistics come from it, because the loop counts every cycle there even if the log lost some.
-    `late_from_s` is a trajectory time, `temperatures_degC` what the drive has reported.
+    `temperatures_degC` is what the drive has reported.
     """
     chosen = records["phase"] == AxisPhase.TRACKING
     # of these fields only: of a long run the records are a file of gigabytes
     tracking = {name: records[name][chosen] for name in ("time_ns", "trajectory_s", "error_rad", *TORQUES.values())}
     time_s, error_rad = tracking_time_s(tracking), tracking["error_rad"]
-    late_from_s = late_from_s if late_from_s is not None else 0.5 * float(time_s[-1]) if len(time_s) else 0.0
-    late = time_s >= late_from_s
+    late = time_s >= (0.5 * time_s[-1] if len(time_s) else 0.0)
     faults = records["fault"][records["fault"] != 0]
     duration_ns = int(records["time_ns"][-1]) - int(records["time_ns"][0]) if len(records) else 0
     named: dict[str, Any] = {key: _range(tracking[key]) for key in TORQUES.values()}

@@ -554,8 +554,8 @@ class LivePanel(OnlyShows):
         return panel(self._title, self._phase, self._snapshot, self._notes, self._joints)
 
 
-def run_display(output: Output, title: str) -> Callable[[], Display]:
+def run_display(output: Output, title: str) -> Callable[[object], Display]:
     """The panel if stderr is a terminal that can move its cursor, else lines; made when the run begins."""
     stream: Any = output.stderr
     terminal = not output.json and not output.quiet and stream.isatty() and not Console(file=stream).is_dumb_terminal
-    return lambda: LivePanel(stream.fileno(), title) if terminal else PhaseLines(output)
+    return lambda _: LivePanel(stream.fileno(), title) if terminal else PhaseLines(output)

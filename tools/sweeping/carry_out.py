@@ -29,7 +29,7 @@ from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
 from jointctl.tools.session.control import in_control
-from jointctl.tools.session.display import Display, OnlyShows, Snapshot, run_display
+from jointctl.tools.session.display import OnlyShows, Snapshot, run_display
 from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
 from jointctl.tools.session.session import Session
@@ -431,10 +431,7 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
     `what` it is for ("map"); `MotionFault` where a fault has ended it.
     """
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
-
-    def display(_: CommissioningReport) -> Display:
-        return run_display(output, f"{plan.config.path.stem}: {what}")()
-
+    display = run_display(output, f"{plan.config.path.stem}: {what}")
     with in_control(plan.config, output) as control:
         session = Session(plan, consent, output, control, display)
         try:

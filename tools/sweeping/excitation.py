@@ -122,7 +122,7 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     )
     model, vector = believed(config)
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
-    slowest = _slowest_radps(config, model, vector)
+    slowest = _slowest_radps(model, vector)
     best: Design | None = None
     for number in range(CANDIDATES):
         random = np.random.default_rng([seed, number])
@@ -142,7 +142,7 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     return best
 
 
-def _slowest_radps(config: Config, model: Model, vector: np.ndarray) -> float:
+def _slowest_radps(model: Model, vector: np.ndarray) -> float:
     """Where a third of the Stribeck effect has decayed, but never slower than standstill, for `identify` to use."""
     stribeck = math.exp(min(vector[model.names.index(f"log_ws {word}")] for word in SIGNS))
     usual = SLOWEST_SHARE * model.top_radps

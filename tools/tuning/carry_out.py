@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
@@ -32,7 +31,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.control import Control
-from jointctl.tools.session.display import Display, run_display
+from jointctl.tools.session.display import run_display
 from jointctl.tools.session.fault_words import FaultText, fault_text
 from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
@@ -130,11 +129,7 @@ class Carrier:
     def _moved(self, config: Config, motion: Motion, title: str) -> Carried:
         assert self.control is not None
         plan = RunPlan(config, motion, log_path(config), self.allow_low_margin)
-
-        def display(_: CommissioningReport) -> Display:
-            return run_display(self.output, title)()
-
-        session = Session(plan, self.consent, self.output, self.control, display)
+        session = Session(plan, self.consent, self.output, self.control, run_display(self.output, title))
         try:
             result = session.run()
         except KeyboardInterrupt:

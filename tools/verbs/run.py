@@ -102,7 +102,7 @@ def _displays(
 
     terminal = run_display(output, title)
     if scope is None:
-        yield lambda _: terminal()
+        yield terminal
         return
     from jointctl.tools.scoping.feed import scope_order, scope_server
 
@@ -111,4 +111,4 @@ def _displays(
     output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})
-        yield lambda _: Displays([terminal(), feed])
+        yield lambda report: Displays([terminal(report), feed])

@@ -138,7 +138,7 @@ class _Runs:
             plan = resolve(config, allow_low_margin=self._allow_low_margin)
             with in_control(config, output) as control:
                 consent = PageConsent(feed, output)
-                session = Session(plan, consent, output, control, lambda _: Displays([terminal(), feed]))
+                session = Session(plan, consent, output, control, lambda report: Displays([terminal(report), feed]))
                 try:
                     result = session.run()
                 finally:

@@ -39,13 +39,6 @@ def test_error_is_that_of_tracking_only() -> None:
     assert summary.fault == "NONE"
 
 
-def test_the_late_part_may_begin_at_a_given_time() -> None:
-    late = summarise(run_records(), late_from_s=0.05).late_error
-    assert late is not None
-    assert late.from_s == pytest.approx(0.05)
-    assert late.range_rad.greatest == 2e-3
-
-
 def test_a_beginning_a_little_before_0_has_no_sign() -> None:
     summary = summarise(run_records())
     assert summary.error is not None
