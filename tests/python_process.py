@@ -1,4 +1,4 @@
-"""Beside other processes: what a command leaves, Python code that must end well, waiting."""
+"""Beside other processes: what a command leaves, Python code that must end well, waiting, children."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 _T = TypeVar("_T")
@@ -52,3 +53,14 @@ def eventually(condition: Callable[[], _T], within_s: float = 10.0, shown: Calla
         assert time.monotonic() < give_up_s, shown()
         time.sleep(0.005)
     return found
+
+
+def children(parent: int) -> list[int]:
+    """Process ids of the direct children."""
+    return [int(pid) for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+
+
+def child(parent: int, module: str) -> int:
+    """The direct child that runs this module; ValueError if there is none."""
+    (pid,) = [pid for pid in children(parent) if module in Path(f"/proc/{pid}/cmdline").read_text()]
+    return pid

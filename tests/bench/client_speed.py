@@ -34,6 +34,7 @@ import jointctl
 from jointctl.tools.output import Output
 from tests.bench.paired import Row, conditions, measured, outcome_data, outcome_table
 from tests.browser import free_port
+from tests.python_process import child
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUP = "client"
@@ -80,7 +81,7 @@ def _onlooker(kind: str, port: int, client_cpu: int | None, costs: list[list[np.
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
         if client_cpu is not None:
             os.sched_setaffinity(process.pid, {client_cpu})
-        pids = [process.pid, _child(f"{kind}_server")]
+        pids = [process.pid, child(os.getpid(), f"{kind}_server")]
 
         def look_on(joint: jointctl.Joint, seconds: float) -> None:
             before = [_used(pid) for pid in pids]
@@ -102,14 +103,6 @@ def _onlooker(kind: str, port: int, client_cpu: int | None, costs: list[list[np.
 def _signal(pids: list[int], number: int) -> None:
     for pid in pids:
         os.kill(pid, number)
-
-
-def _child(module: str) -> int:
-    """The process of ours that runs this module."""
-    for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
-        if module in Path(f"/proc/{pid}/cmdline").read_text():
-            return int(pid)
-    raise RuntimeError(f"no process of ours runs {module}")
 
 
 def _stream(joint: jointctl.Joint, seconds: float, rate_Hz: float) -> None:

@@ -10,6 +10,7 @@ reads the log: records lost, and whether deadline N is start + N periods to the 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
@@ -27,6 +28,7 @@ sys.path.insert(0, str(ROOT))
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log  # noqa: E402
 from tests.bench.paired import separate_virtual_joint  # noqa: E402
 from tests.configurations import written  # noqa: E402
+from tests.python_process import child  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up
 COMPARED_S = 60.0  # first and last minute are compared
@@ -62,21 +64,6 @@ class Watched:
             "handles_first": first[2],
             "handles_last": last[2],
         }
-
-
-def loop_process_of(parent: int) -> int | None:
-    """Process id of the loop that `jointctl run` has started."""
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            command = (entry / "cmdline").read_bytes()
-            stat = (entry / "stat").read_text()
-        except OSError:
-            continue
-        if b"loop_process" in command and int(stat.rsplit(")", 1)[1].split()[1]) == parent:
-            return int(entry.name)
-    return None
 
 
 def long_config(folder: Path, duration_s: float) -> Path:
@@ -129,8 +116,9 @@ def soak(minutes: float, folder: Path, every_s: float) -> dict[str, Any]:
         started_s = time.monotonic()
         loads = []
         while run.poll() is None:
-            if "loop" not in watched and (loop := loop_process_of(run.pid)) is not None:
-                watched["loop"] = Watched(loop)
+            if "loop" not in watched:
+                with contextlib.suppress(OSError, ValueError):  # not begun yet
+                    watched["loop"] = Watched(child(run.pid, "loop_process"))
             now_s = time.monotonic() - started_s
             if now_s < 60.0 * minutes + 1.0:  # what comes later is the report's, not the run's
                 for one in watched.values():

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
-from tests.python_process import Finished
+from tests.python_process import Finished, child, children
 from tests.real_time_joint import real_time_joint
 
 
@@ -43,10 +44,14 @@ class Started:
 
     def saw(self, text: str, timeout_s: float = 180.0) -> Started:
         """Wait until stderr holds the text; the first start may have to compile."""
+        return self.until(lambda: text in self.err, text, timeout_s)
+
+    def until(self, condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> Started:
+        """Wait until the condition holds; it must do so before the process ends."""
         give_up_s = time.monotonic() + timeout_s
-        while text not in self.err:
-            assert self.process.poll() is None, f"ended with {self.process.returncode} before {text!r}: {self.err}"
-            assert time.monotonic() < give_up_s, f"no {text!r} in: {self.err}"
+        while not condition():
+            assert self.process.poll() is None, f"ended with {self.process.returncode} before {what!r}: {self.err}"
+            assert time.monotonic() < give_up_s, f"no {what!r} in: {self.err}"
             time.sleep(0.01)
         return self
 
@@ -60,14 +65,11 @@ class Started:
 
     def children(self) -> list[int]:
         """Process ids of the direct children."""
-        return [
-            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
-        ]
+        return children(self.process.pid)
 
     def child(self, module: str) -> int:
         """The direct child that runs this module."""
-        (pid,) = [pid for pid in self.children() if module in Path(f"/proc/{pid}/cmdline").read_text()]
-        return pid
+        return child(self.process.pid, module)
 
     def end(self) -> None:
         if self.process.poll() is None:

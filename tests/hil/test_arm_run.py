@@ -8,7 +8,6 @@ import re
 import signal
 import struct
 import time
-from pathlib import Path
 from typing import Any
 
 import can
@@ -137,9 +136,7 @@ def test_a_drive_that_restarts_stops_the_others_along_their_ramps(arm: ArmBench,
 @pytest.mark.parametrize("dies", ["loop", "both"])
 def test_loop_or_all_killed_every_drive_stops_by_its_own_watchdog(arm: ArmBench, dies: str) -> None:
     run = arm.tracking()
-    loop = next(
-        pid for pid in run.children() if b"loop_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )  # fmt: skip
+    loop = run.child("loop_process")
     if dies == "both":
         run.signal(signal.SIGKILL)
     os.kill(loop, signal.SIGKILL)

@@ -124,16 +124,21 @@ def test_a_terminal_that_takes_nothing_holds_nobody_up(how: str) -> None:
             os.close(master)
 
 
+def read_until_tracking(master: int, timeout_s: float) -> str:
+    text, give_up = "", time.monotonic() + timeout_s
+    while " tracking" not in text:
+        assert time.monotonic() < give_up, text
+        text += read_all(master)
+        time.sleep(0.01)
+    return text
+
+
 def test_a_terminal_that_takes_it_gets_the_panel() -> None:
     master, slave = opened_terminal()
     try:
         with LivePanel(slave, "joint: sine", refresh_s=0.01) as live:
             live.show(snapshot())
-            text, give_up = "", time.monotonic() + 30.0
-            while " tracking" not in text:
-                assert time.monotonic() < give_up, text
-                text += read_all(master)
-                time.sleep(0.01)
+            text = read_until_tracking(master, 30.0)
         assert "joint: sine" in text
     finally:
         os.close(slave)
@@ -186,11 +191,7 @@ def test_a_run_on_a_stopped_terminal_goes_on_to_its_end(bench: Any) -> None:
     master, slave = opened_terminal()
     try:
         started = bench.start("run", config, "-y", stderr=slave, env=TERMINAL)
-        text, give_up = "", time.monotonic() + 180.0
-        while " tracking" not in text:
-            assert time.monotonic() < give_up, text
-            text += read_all(master)
-            time.sleep(0.01)
+        read_until_tracking(master, 180.0)
         termios.tcflow(slave, termios.TCOOFF)
         assert started.process.wait(30.0) == 0
     finally:

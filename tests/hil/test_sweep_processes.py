@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from typing import Any
 
 import numpy as np
@@ -31,11 +30,7 @@ def joint(bench: Any) -> Any:
 def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     out = joint.folder / "data.csv"
     started = joint.start(*SWEEP, "-y")
-    give_up_s = time.monotonic() + 120.0
-    while not (out.exists() and len(out.read_text().splitlines()) >= 3):
-        assert started.process.poll() is None, started.err
-        assert time.monotonic() < give_up_s, started.err
-        time.sleep(0.05)
+    started.until(lambda: out.exists() and len(out.read_text().splitlines()) >= 3, "three rows")
     started.signal(signal.SIGINT)
     done = started.finished()
     assert done.code == 130, done.err

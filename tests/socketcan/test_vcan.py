@@ -104,9 +104,9 @@ def candump(*what: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def tracking(folder: Path, config: str) -> Iterator[subprocess.Popen[str]]:
+def tracking(folder: Path, config: str, *, interface: tuple[str, ...] = ON_VCAN) -> Iterator[subprocess.Popen[str]]:
     """A `jointctl run` that has reached its trajectory."""
-    command = jointctl("run", config, *ON_VCAN, *SLOW_GUEST)
+    command = jointctl("run", config, *interface, *SLOW_GUEST)
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as started:
         assert started.stderr is not None
         seen = [""]
@@ -226,14 +226,8 @@ def test_an_arm_on_two_interfaces_moves_and_stops_as_one(tmp_path: Path) -> None
             assert drives.stderr is not None
             while "Ctrl-C ends it" not in (line := drives.stderr.readline()):
                 assert line, f"ended with {drives.wait()}"
-            with subprocess.Popen(
-                jointctl("run", "arm/arm.toml", *SLOW_GUEST), cwd=tmp_path, stderr=subprocess.PIPE, text=True
-            ) as started:
+            with tracking(tmp_path, "arm/arm.toml", interface=()) as started:
                 assert started.stderr is not None
-                seen = [""]
-                while "tracking" not in seen[-1]:
-                    seen.append(started.stderr.readline())
-                    assert seen[-1], f"ended with {started.wait()}: {''.join(seen)}"
                 stopped = run(tmp_path, "stop", "arm/wrist.toml")
                 assert stopped.returncode == 0, stopped.stderr
                 rest = started.stderr.read()
