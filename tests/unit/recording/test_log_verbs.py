@@ -23,8 +23,6 @@ from mcap_ros2.decoder import DecoderFactory
 
 from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault
 from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, DriveState
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import frame_array, stamps_ns
@@ -43,6 +41,7 @@ from jointctl.tools.session.run_watch import FrameRecorder, recording
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs.log import log_export, log_info, log_plot
 from tests.configurations import changed
+from tests.run_records import START_NS, eventful_records
 from tests.sessions import output
 
 
@@ -135,7 +134,7 @@ def test_the_room_for_a_run_is_what_its_log_takes(tmp_path: Path) -> None:
     def size(count: int) -> int:
         path = tmp_path / f"{count}.mcap"
         with RunLogWriter(path, {}) as log:
-            log.write_records(run_records(count))
+            log.write_records(eventful_records(count))
         return path.stat().st_size
 
     assert (size(12_000) - size(2000)) / 10_000 == pytest.approx(MESSAGE_BYTES, rel=5e-3)
@@ -159,30 +158,6 @@ def test_a_joint_outside_its_limits_is_told_before_anybody_is_asked(
 
 
 # --- `jointctl log`: what is told, what is exported, and that foreign readers read it back; raw frames ---
-START_NS = 5_000_000_000
-WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}
-
-
-def run_records(count: int = 400, first: int = 0) -> Any:
-    """A run of 1 kHz that waits, enables, tracks, and is switched off in its last 50 cycles."""
-    records = new(LogRecord, count)
-    index = np.arange(first, first + count)
-    records.cycle = index + 1
-    records.time_ns = START_NS + index * 1_000_000
-    records.phase = AxisPhase.TRACKING
-    records.drive_state = DriveState.ENABLED
-    records.trajectory_s = index * 1e-3
-    records.position_rad = np.sin(index / 50.0)
-    records.error_rad = 1e-3 / (1 + index)
-    records.weights = np.arange(15) + index[:, None] / 7.0
-    if first == 0:
-        records.phase[:20], records.drive_state[:20] = AxisPhase.WAITING, DriveState.OFF
-        records.phase[20:30], records.drive_state[20:30] = AxisPhase.ENABLING, DriveState.STARTING
-        records.phase[-50:], records.drive_state[-50:] = AxisPhase.FINISHED, DriveState.OFF
-    records.status_word = [WORDS[DriveState(state)] for state in records.drive_state]
-    return records
-
-
 def some_frames() -> np.ndarray:
     """A SYNC, an extended frame, a remote frame, an error frame, a full one; 1 ms apart."""
     messages = [
@@ -199,7 +174,7 @@ def some_frames() -> np.ndarray:
 def made_log(tmp_path: Path) -> Path:
     path = tmp_path / "run.mcap"
     with RunLogWriter(path, {"run": {"configuration": "", "path": "joint.toml"}, "drive": {"serial": "7"}}) as log:
-        records = run_records()
+        records = eventful_records()
         log.write_frames(some_frames()[:2])
         log.write_records(records[:300])
         for event in EventFinder(session_drive("canopen")).take(records):
@@ -234,7 +209,7 @@ def test_info_tells_what_the_log_holds(made_log: Path) -> None:
 def test_a_log_that_is_thinned_on_purpose_misses_nothing(tmp_path: Path) -> None:
     path = tmp_path / "sweep.mcap"
     with RunLogWriter(path, {THINNING: {"every": "20", "whole_s": "2"}}) as log:
-        log.write_records(run_records()[::20])
+        log.write_records(eventful_records()[::20])
     data = spoken(log_info, path)
     assert (data["records_kept"], data["missing_records"]) == ("every 20th, the last 2 s whole", None)
     told, out, _ = output()
@@ -251,7 +226,7 @@ def test_info_of_a_log_that_was_cut_off_says_so(made_log: Path) -> None:
 
 
 def test_missing_records_are_jumps_of_the_cycle_that_were_not_skipped() -> None:
-    records = run_records()
+    records = eventful_records()
     assert missing_records(records) == 0
     records.cycle[200:] += 3
     assert missing_records(records) == 3
@@ -266,7 +241,7 @@ def test_csv_has_every_digit_of_every_field(made_log: Path) -> None:
     target = Path(spoken(log_export, made_log, "csv")["file"])
     with target.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    records = run_records()
+    records = eventful_records()
     assert len(rows) == 400
     for name in ("position_rad", "error_rad", "trajectory_s"):
         np.testing.assert_array_equal([float(row[name]) for row in rows], records[name])
@@ -278,7 +253,7 @@ def test_npz_holds_the_records_and_the_events(made_log: Path) -> None:
     target = Path(spoken(log_export, made_log, "npz")["file"])
     with np.load(target) as arrays:
         for name in LogRecord.__annotations__:
-            np.testing.assert_array_equal(arrays[name], run_records()[name], err_msg=name)
+            np.testing.assert_array_equal(arrays[name], eventful_records()[name], err_msg=name)
         assert "loop: tracking" in arrays["event_text"].tolist()
 
 
@@ -356,7 +331,7 @@ def test_the_log_itself_is_never_overwritten(made_log: Path, format: str) -> Non
 
 def test_candump_of_a_log_without_frames_tells_how_to_get_them(tmp_path: Path) -> None:
     with RunLogWriter(tmp_path / "run.mcap", {}) as log:
-        log.write_records(run_records())
+        log.write_records(eventful_records())
     with pytest.raises(DataError, match="no CAN frames") as caught:
         log_export(tmp_path / "run.mcap", Output(), "candump")
     assert "log.frames" in caught.value.hint
@@ -370,7 +345,7 @@ def test_a_hundred_thousand_records_with_frames_between_them_all_come_back(tmp_p
     path, size = tmp_path / "long.mcap", 20
     with RunLogWriter(path, {}) as log:
         for first in range(0, 100_000, 5000):
-            piece = run_records(5000, first + 1)
+            piece = eventful_records(5000, first + 1)
             for at in range(0, 5000, size):
                 log.write_records(piece[at : at + size])
                 log.write_frames(some_frames()[:1] if at % 1000 else some_frames())

@@ -19,7 +19,7 @@ from jointctl.drivers.errors import DataError, DeviceError, MotionFault
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState, LogRecord
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Notice
+from jointctl.firmware_py.states import DriveState, Fault, Notice
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, WARNING, Event
@@ -41,7 +41,7 @@ from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.run_watch import RunWatch
 from jointctl.tools.session.session_drive import session_drive
 from tests.configurations import changed
-from tests.run_records import run_records
+from tests.run_records import START_NS, WORDS, eventful_records, run_records
 
 # --- What the user is told of each fault: what happened with numbers, code and name, likely cause, next step ---
 FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
@@ -252,25 +252,6 @@ def test_faults_that_no_pause_causes_are_left_alone() -> None:
 
 
 # --- Events: what happened in a run, found in its records; error codes in words ---
-START_NS = 5_000_000_000
-WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}
-
-
-def eventful_records() -> Any:
-    """A run of 1 kHz that waits, enables, tracks, and is switched off in its last 50 cycles."""
-    records = new(LogRecord, 400)
-    index = np.arange(400)
-    records.cycle = index + 1
-    records.time_ns = START_NS + index * 1_000_000
-    records.phase = AxisPhase.TRACKING
-    records.drive_state = DriveState.ENABLED
-    records.phase[:20], records.drive_state[:20] = AxisPhase.WAITING, DriveState.OFF
-    records.phase[20:30], records.drive_state[20:30] = AxisPhase.ENABLING, DriveState.STARTING
-    records.phase[-50:], records.drive_state[-50:] = AxisPhase.FINISHED, DriveState.OFF
-    records.status_word = [WORDS[DriveState(state)] for state in records.drive_state]
-    return records
-
-
 @pytest.mark.parametrize("size", [1, 7, 20, 400])
 def test_events_are_the_same_whatever_the_pieces(size: int) -> None:
     finder, records = EventFinder(session_drive("canopen")), eventful_records()
