@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,6 +30,13 @@ from tests.contract.ends_of_a_bus import (
 from tests.python_process import eventually
 
 END = (0x7AA, b"")  # the last frame of a test
+
+
+@contextmanager
+def joining(connect: Callable[[], End]) -> Iterator[Callable[[], End]]:
+    """What opens one more end; all are closed with the block."""
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(closing(connect()))
 
 
 class BusContract:
@@ -98,13 +105,7 @@ class HubContract(BusContract):
 
     @pytest.fixture
     def join(self, hub: VirtualBusHub) -> Iterator[Callable[[], End]]:
-        with ExitStack() as stack:
-
-            def connect() -> End:
-                end = self.connect(hub.path)
-                stack.callback(end.close)
-                return end
-
+        with joining(lambda: self.connect(hub.path)) as connect:
             yield connect
 
     def connect(self, path: Path) -> End:
@@ -231,13 +232,7 @@ class TestInterfaceVirtualOfPythonCan(BusContract):
 
     @pytest.fixture
     def join(self, tmp_path: Path) -> Iterator[Callable[[], End]]:
-        with ExitStack() as stack:
-
-            def connect() -> End:
-                end = PythonCanEnd(open_python_can("virtual", str(tmp_path)))
-                stack.callback(end.close)
-                return end
-
+        with joining(lambda: PythonCanEnd(open_python_can("virtual", str(tmp_path)))) as connect:
             yield connect
 
 

@@ -135,6 +135,12 @@ class Bench:
         """The virtual joint in this process, for tests that need one and no more."""
         self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
 
+    def with_joint(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
+        """A configuration as of `config`, and its virtual joint in this process."""
+        config = self.config(name, base, **changes)
+        self.joint(config)
+        return config
+
     def arm_joints(self, path: Path) -> None:
         """Those of an arm, likewise."""
         self._joints.enter_context(real_time_joint(load_arm(path)))

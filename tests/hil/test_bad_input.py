@@ -52,7 +52,7 @@ def test_a_bus_without_a_device(bench: Any) -> None:
 
 def test_refusals_of_one_joint(bench: Any) -> None:
     """One virtual joint, many configurations that do not fit it; the power stage stays off all the time."""
-    bench.joint(bench.config(virtual__initial_position_rad=0.1))
+    bench.with_joint(virtual__initial_position_rad=0.1)
     (bench.folder / "short.eds").write_text(eds_without(EDS.read_text(), "6072"))
     (bench.folder / "file").write_text("a file where a folder should be")
     witness = Witness(bench)
@@ -74,8 +74,7 @@ def test_refusals_of_one_joint(bench: Any) -> None:
 
 def test_the_witness_sees_a_joint_that_is_enabled(bench: Any) -> None:
     """The twin of the refusals: a good configuration does enable."""
-    name = bench.config()
-    bench.joint(name)
+    name = bench.with_joint()
     witness = Witness(bench)
     assert bench.run("run", name, "-y").code == 0
     assert witness.enabled > 100

@@ -37,8 +37,7 @@ class WatchedRun:
 
     def __init__(self, bench: Any, *options: str, **changes: Any) -> None:
         self.bench = bench
-        config = bench.config(**{**ENDLESS, **PATIENT, **changes})
-        bench.joint(config)
+        config = bench.with_joint(**{**ENDLESS, **PATIENT, **changes})
         self.program = bench.start("run", config, "-y", *options)
 
     def ended(self, code: int = 130) -> Any:
@@ -220,7 +219,7 @@ with jointctl.Joint("joint.toml", foxglove="127.0.0.1:{port}", allow_remote=True
 
 def test_beside_a_program_set_points_are_the_programs(bench: Any) -> None:
     port = free_port()
-    bench.joint(bench.config(**PATIENT))
+    bench.with_joint(**PATIENT)
     program = bench.program(PROGRAM.format(port=port)).saw("enabled")
     with FoxgloveClient(port) as client:
         client.subscribe("/joint_states").newest("/joint_states")
@@ -238,8 +237,7 @@ def test_beside_a_program_set_points_are_the_programs(bench: Any) -> None:
 
 def test_a_sweep_shows_its_states_and_stops(bench: Any) -> None:
     port = free_port()
-    config = bench.config(base="sweep_virtual")
-    bench.joint(config)
+    config = bench.with_joint(base="sweep_virtual")
     sweep = bench.start("sweep", config, "-y", "-o", "data.csv", "--foxglove", f"127.0.0.1:{port}")
     with FoxgloveClient(port) as client:
         client.subscribe("/joint")

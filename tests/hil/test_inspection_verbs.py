@@ -17,8 +17,7 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_a_run_goes_on_beside_monitor_info_and_scan(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=60.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=60.0)
     monitor = bench.start("monitor", config, "--json").saw("listening on")
     run = bench.start("run", config, "-y").saw("tracking")
     info = bench.run("info", config, "--json")
@@ -53,7 +52,7 @@ def test_a_run_goes_on_beside_monitor_info_and_scan(bench: Any) -> None:
 
 @pytest.mark.parametrize("verb", ["monitor", "scan"])
 def test_ctrl_c_ends_cleanly(bench: Any, verb: str) -> None:
-    bench.joint(bench.config())
+    bench.with_joint()
     options = ("--listen", "30") if verb == "scan" else ()
     started = bench.start(verb, "-i", "jointctl", "-c", bench.channel, *options).saw("listening on")
     time.sleep(0.2)

@@ -69,8 +69,7 @@ class Script(OnlyShows):
 
 
 def carried_out(bench: Any, *requests: tuple[str, dict[str, Any]], **changes: Any) -> tuple[Script, RunResult]:
-    name = bench.config(trajectory__duration_s=0.0, live={"gain_factor": 2.0, "ramp_s": 0.2}, **changes)
-    bench.joint(name)
+    name = bench.with_joint(trajectory__duration_s=0.0, live={"gain_factor": 2.0, "ramp_s": 0.2}, **changes)
     config = load_config(bench.folder / name)
     script = Script([ViewerRequest(kind, WHO, values) for kind, values in requests])
     path = Path(bench.folder) / "runs" / "live.mcap"
@@ -170,8 +169,7 @@ def test_before_the_joint_is_under_way_nothing_is_taken(bench: Any, kind: str) -
             super().settings({**values, "under_way": False})
             self._settled += 2
 
-    name = bench.config(trajectory__duration_s=0.3)
-    bench.joint(name)
+    name = bench.with_joint(trajectory__duration_s=0.3)
     script = Early([ViewerRequest(kind, WHO, {"kp": 700.0, "position_rad": 0.1})])
     config = load_config(bench.folder / name)
     path = Path(bench.folder) / "runs" / "early.mcap"

@@ -158,8 +158,7 @@ def test_lines_where_there_is_no_terminal() -> None:
 
 
 def test_run_on_a_terminal_shows_the_panel_and_its_log_has_every_cycle_and_frame(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=5.0, log__frames=True)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=5.0, log__frames=True)
     terminal = Terminal(bench, "run", config, "-y", env=TERMINAL)
     done, text = terminal.finished(180.0), terminal.text
     assert done.code == 0, text
@@ -186,8 +185,7 @@ def test_run_on_a_terminal_shows_the_panel_and_its_log_has_every_cycle_and_frame
 
 
 def test_a_run_on_a_stopped_terminal_goes_on_to_its_end(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=2.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=2.0)
     master, slave = opened_terminal()
     try:
         started = bench.start("run", config, "-y", stderr=slave, env=TERMINAL)

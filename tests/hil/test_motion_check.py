@@ -10,8 +10,7 @@ from tests.python_process import eventually
 
 
 def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(bench: Any) -> None:
-    right = bench.config()
-    bench.joint(right)
+    right = bench.with_joint()
     done = bench.start("doctor", right, "--motion", "-y").finished()
     assert done.code == 0, done.err + done.out
     assert "the joint moved with the torque" in " ".join(done.out.replace("│", " ").split())
@@ -25,8 +24,7 @@ def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(benc
 
 
 def test_it_asks_and_ctrl_c_and_the_loss_of_the_watcher_end_it_safely(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     bench.start("doctor", config, "--motion").finished().refused(2, "there is no terminal to ask on")
     check = bench.start("doctor", config, "--motion", "-y").saw("  tracking")
     check.signal(signal.SIGINT, group=True)

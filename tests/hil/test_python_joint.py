@@ -39,10 +39,7 @@ STREAM = """
 
 def started(bench: Any, body: str, approve: str = "", **changes: Any) -> Any:
     # a busy computer must not be the fault that is seen
-    config = bench.config(
-        **{"stream__delay_s": 0.3, "stream__timeout_s": 1.0, "stream__client_timeout_s": 3.0, **changes}
-    )
-    bench.joint(config)
+    bench.with_joint(**{"stream__delay_s": 0.3, "stream__timeout_s": 1.0, "stream__client_timeout_s": 3.0, **changes})
     return bench.program(PROGRAM.format(body=body.strip(), approve=approve))
 
 
@@ -215,8 +212,7 @@ joint.wait(1.5)
 
 @pytest.mark.parametrize("body", ["", DAEMON], ids=["commissioned", "moved by a daemon thread"])
 def test_a_program_that_ends_without_leaving_the_block_leaves_nothing_running(bench: Any, body: str) -> None:
-    config = bench.config(stream__client_timeout_s=3.0)
-    bench.joint(config)
+    bench.with_joint(stream__client_timeout_s=3.0)
     program = bench.program(UNLEFT.format(body=body)).saw("the end")
     assert program.finished(20.0).code == 0
     if body:

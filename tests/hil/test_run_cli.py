@@ -31,8 +31,7 @@ def entered(records: Any) -> list[AxisPhase]:
 
 @pytest.mark.stays("supervisor: the user")
 def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None:
-    config = bench.config(trajectory__amplitude_rad=0.1)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__amplitude_rad=0.1)
     for number in (1, 2):
         done = bench.run("run", config, "-y", "--json", env={**os.environ, "TERM": "xterm-256color"})
         assert done.code == 0, done.err
@@ -48,8 +47,7 @@ def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None
 
 def test_a_motor_that_warms_up_is_seen_in_summary_log_and_export(bench: Any) -> None:
     heat = {"virtual__thermal": True, "virtual__heating_KpA2": 20.0, "virtual__thermal_time_s": 10.0}
-    config = bench.config(trajectory__duration_s=4.0, **heat)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=4.0, **heat)
     done = bench.run("run", config, "-y", "--json")
     assert done.code == 0, done.err
     told = json.loads(done.out)["temperature_degC"]
@@ -62,8 +60,7 @@ def test_a_motor_that_warms_up_is_seen_in_summary_log_and_export(bench: Any) -> 
 
 def test_a_drive_without_6072_runs_within_its_makers_limit_and_has_it_back(bench: Any) -> None:
     (bench.folder / "maker.eds").write_text(eds_text(EPOS4), encoding="latin-1")
-    config = bench.config(**{f"drive__{key}": value for key, value in EPOS4_KEYS.items()})
-    bench.joint(config)
+    config = bench.with_joint(**{f"drive__{key}": value for key, value in EPOS4_KEYS.items()})
     done = bench.run("run", config, "-y")
     assert done.code == 0, done.err
     assert "no object 6072: the drive limits its torque by 3001:2 = 4958 (was 5000) = 60.0 Nm" in done.err
@@ -77,8 +74,7 @@ def test_a_drive_without_6072_runs_within_its_makers_limit_and_has_it_back(bench
 @pytest.mark.trips("supervisor: the user")
 @pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "SIGINT"), (signal.SIGTERM, "SIGTERM")])
 def test_one_stop_signal_while_tracking_ramps_down(bench: Any, number: int, name: str) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     started = bench.start("run", config, "-y").saw("  tracking")
     time.sleep(0.3)
     started.signal(number, group=True)
@@ -101,12 +97,11 @@ def test_one_stop_signal_while_tracking_ramps_down(bench: Any, number: int, name
 
 def test_a_second_ctrl_c_is_a_quick_stop(bench: Any) -> None:
     # braking so gently that the second signal surely comes while the joint moves
-    config = bench.config(
+    config = bench.with_joint(
         trajectory__duration_s=30.0, sequence__approach_s=1.5,
         sequence__brake_radps2=0.05, sequence__stop_timeout_s=30.0,
         limits__position_min_rad=-1.5, limits__position_max_rad=1.5,
     )  # fmt: skip
-    bench.joint(config)
     started = bench.start("run", config, "-y").saw("  tracking")
     started.signal(signal.SIGINT, group=True)
     started.saw("  ramping").signal(signal.SIGINT, group=True)
@@ -120,8 +115,7 @@ def test_a_second_ctrl_c_is_a_quick_stop(bench: Any) -> None:
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.7, 1.5])
 def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
-    config = bench.config(trajectory__duration_s=30.0, sequence__settle_s=5.0, sequence__wait_timeout_s=60.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0, sequence__settle_s=5.0, sequence__wait_timeout_s=60.0)
     started = bench.start("run", config, "-y")
     time.sleep(delay_s)
     started.signal(signal.SIGINT, group=True)
@@ -139,8 +133,7 @@ def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
 
 
 def test_answering_no_moves_nothing(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     terminal = Terminal(bench, "run", config).saw("[y/N]")
     os.write(terminal.master, b"\n")
     terminal.saw("nothing moved")
@@ -150,8 +143,7 @@ def test_answering_no_moves_nothing(bench: Any) -> None:
 
 
 def test_ctrl_c_at_the_question_ends_it(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     terminal = Terminal(bench, "run", config).saw("[y/N]")
     terminal.started.signal(signal.SIGINT, group=True)
     terminal.saw("interrupted; nothing moved", 10.0)
@@ -160,8 +152,7 @@ def test_ctrl_c_at_the_question_ends_it(bench: Any) -> None:
 
 
 def test_a_terminal_that_is_closed_while_tracking_ramps_down(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     terminal = Terminal(bench, "run", config, "-y").saw(" tracking")
     os.close(terminal.master)  # from now on writing to it is an error
     terminal.started.signal(signal.SIGHUP)
@@ -174,8 +165,7 @@ def test_a_terminal_that_is_closed_while_tracking_ramps_down(bench: Any) -> None
 
 
 def test_a_run_whose_output_nobody_reads_any_more_goes_on_to_its_end(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     reading, writing = os.pipe()
     with os.fdopen(reading) as reader:
         started = bench.start("run", config, "-y", stderr=writing)
@@ -188,8 +178,7 @@ def test_a_run_whose_output_nobody_reads_any_more_goes_on_to_its_end(bench: Any)
 
 
 def test_dry_run_commissions_and_moves_nothing(bench: Any) -> None:
-    config = bench.config(virtual__initial_position_rad=0.1)
-    bench.joint(config)
+    config = bench.with_joint(virtual__initial_position_rad=0.1)
     done = bench.run("run", config, "--dry-run")
     assert done.code == 0, done.err
     assert "now at     +0.1000 rad" in done.err
@@ -199,8 +188,7 @@ def test_dry_run_commissions_and_moves_nothing(bench: Any) -> None:
 
 
 def test_a_disk_that_fills_while_tracking_ramps_down(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     started = bench.start("run", config, "-y").saw("  tracking")
     resource.prlimit(started.process.pid, resource.RLIMIT_FSIZE, (1024, 1024))
     started.finished(20.0).refused(8, "runs/", "cannot be written")
@@ -208,8 +196,7 @@ def test_a_disk_that_fills_while_tracking_ramps_down(bench: Any) -> None:
 
 
 def test_a_disk_that_is_full_before_motion_moves_nothing(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     terminal = Terminal(bench, "run", config).saw("[y/N]")
     resource.prlimit(terminal.started.process.pid, resource.RLIMIT_FSIZE, (16, 16))
     os.write(terminal.master, b"y\n")

@@ -63,8 +63,7 @@ def environment() -> dict[str, str]:
 def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple[Any, Tab, str]:
     """`jointctl scope CONFIG` on a joint of its own, and its page at "ready"."""
     # with a browser beside it the loop may stand still for milliseconds: that is not what these tests are about
-    config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0, **changes)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0, **changes)
     scope, tab, url = page_of(bench, browser, config, *options)
     state_is(tab, "ready; nothing moves")
     return scope, tab, url
@@ -213,8 +212,7 @@ def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, browser:
 
 
 def test_what_is_prepared_after_a_stop_is_a_new_run(bench: Any, browser: Browser) -> None:
-    config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0)
     run = bench.start("run", config, "-y").saw("tracking")
     scope, tab, _ = page_of(bench, browser, config)
     tab.until("document.querySelector('[data-testid=\"start-panel\"]').innerText.includes('another program controls')")

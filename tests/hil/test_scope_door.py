@@ -52,8 +52,7 @@ def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool, hos
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    config = bench.config(trajectory__duration_s=0.0 if live else 0.2)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=0.0 if live else 0.2)
     if not live:
         assert bench.run("run", config, "-y").code == 0
     port = free_port()
@@ -103,8 +102,7 @@ def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool, hos
 
 
 def test_the_address_is_printed_with_a_run_as_well(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=0.5)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=0.5)
     done = bench.run("run", config, "-y", "--scope", "--scope-port", str(free_port()), "--quiet", "--json",
                      env=environment())  # fmt: skip
     assert done.code == 0, done.err

@@ -30,8 +30,7 @@ def _inject_heartbeat_loss(bench: Any, node: int = 1) -> None:
 
 @pytest.mark.trips("user: everything")
 def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     run = bench.start("run", config, "-y").saw("tracking")
     stopped = bench.run("stop", config)
     assert (stopped.code, "switch on disabled" in stopped.out) == (0, True), stopped
@@ -42,8 +41,7 @@ def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
 
 
 def test_stop_is_not_lost_to_a_file_that_is_being_edited(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     run = bench.start("run", config, "-y").saw("tracking")
     path = bench.folder / config
     path.write_text(path.read_text().replace("[control]", "[control]\nkp = -3\nki =", 1))
@@ -57,15 +55,13 @@ def test_stop_is_not_lost_to_a_file_that_is_being_edited(bench: Any) -> None:
 
 @pytest.mark.stays("user: everything")
 def test_stop_of_a_resting_joint_is_harmless(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     assert bench.run("stop", config).code == 0
     assert bench.run("run", config, "-y").code == 0  # the twin: it can be run as before
 
 
 def test_clear_fault_resets_and_leaves_the_drive_off(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     _inject_heartbeat_loss(bench)
     bench.run("run", config, "-y").refused(6, "fault")
     cleared = bench.run("clear-fault", config)

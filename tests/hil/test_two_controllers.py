@@ -19,8 +19,7 @@ OTHERS = (("run", "-y"), ("clear-fault",), ("doctor", "--motion", "-y"))
 
 
 def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=60.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=60.0)
     first = bench.start("run", config, "-y").saw("  tracking")
     for verb in OTHERS:
         bench.run(*verb, config).refused(4, "another program controls", f"pid {first.process.pid}")
@@ -32,8 +31,7 @@ def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
 
 
 def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
-    config = bench.config(drive__heartbeat_s=0.5)
-    bench.joint(config)
+    config = bench.with_joint(drive__heartbeat_s=0.5)
     assert bench.run("params", "dump", config, "-o", "kept.dcf").code == 0
     first = Terminal(bench, "run", config).saw("[y/N]")
     with can.Bus(interface="jointctl", channel=bench.channel) as ear:
@@ -48,8 +46,7 @@ def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
 
 
 def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     started = [bench.start("run", config, "-y") for _ in range(2)]
     finished = sorted((one.finished() for one in started), key=lambda done: done.code)
     assert finished[0].code == 0, finished[0].err
@@ -58,8 +55,7 @@ def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
 
 
 def test_stop_ends_a_program_that_waits_for_its_user(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     first = Terminal(bench, "run", config).saw("[y/N]")
     assert bench.run("stop", config).code == 0
     ended = first.finished()
@@ -69,8 +65,7 @@ def test_stop_ends_a_program_that_waits_for_its_user(bench: Any) -> None:
 
 
 def test_stop_ends_a_tune_that_waits_for_its_user(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     first = Terminal(bench, "tune", config).saw("[y/N]")
     bench.run("run", config, "-y").refused(4, "another program controls")
     assert bench.run("stop", config).code == 0
@@ -84,8 +79,7 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
 
     After each frame of it, at simulated time: tests/faults/test_every_frame.py.
     """
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     run = bench.start("run", config, "-y")
     time.sleep(delay_s)
     stopped = bench.run("stop", config)
@@ -104,8 +98,7 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
 )  # fmt: skip
 def test_whatever_is_stopped_says_that_a_stop_has_ended_it(bench: Any, verb: tuple[str, ...]) -> None:
     """And it takes the frames of that stop for no other controller's."""
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     started = bench.start(*verb, config)
     assert bench.run("stop", config).code == 0
     ended = started.finished(20.0)
@@ -117,8 +110,7 @@ def test_whatever_is_stopped_says_that_a_stop_has_ended_it(bench: Any, verb: tup
 
 
 def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0, sequence__supervisor_timeout_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0, sequence__supervisor_timeout_s=30.0)
     run = bench.start("run", config, "-y").saw("  tracking")
     run.process.send_signal(signal.SIGSTOP)
     stopped = bench.run("stop", config)
@@ -131,8 +123,7 @@ def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
 
 @pytest.mark.parametrize("data", [b"\x0f\0\x2c\x01", b"\x06\0\0\0"], ids=["torque", "shutdown"])
 def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, data: bytes) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=30.0)
     run = bench.start("run", config, "-y").saw("  tracking")
     with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
         foreign.send(can.Message(arbitration_id=0x201, data=data, is_extended_id=False))
@@ -142,8 +133,7 @@ def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, da
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
+    config = bench.with_joint()
     with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
         sender = foreign.send_periodic(can.Message(arbitration_id=SYNC_ID, is_extended_id=False), 0.01)
         for verb in (("run", "-y"), ("clear-fault",)):

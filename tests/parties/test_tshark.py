@@ -104,8 +104,7 @@ def test_no_frame_is_malformed(joint: Any, tmp_path: Path) -> None:
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 def test_no_frame_of_a_real_run_is_malformed(bench: Any) -> None:
     """`run` on the joint of another process: its log, exported as docs/virtual-joint.md says, and read by tshark."""
-    config = bench.config(trajectory__duration_s=1.0, log__frames=True)
-    bench.joint(config)
+    config = bench.with_joint(trajectory__duration_s=1.0, log__frames=True)
     assert bench.run("run", config, "-y").code == 0
     (log,) = bench.folder.glob("runs/*.mcap")
     exported = bench.run("log", "export", str(log), "--format", "candump", "-o", "run.log")
