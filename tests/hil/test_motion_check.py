@@ -11,9 +11,9 @@ from tests.python_process import eventually
 
 def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(bench: Any) -> None:
     right = bench.with_joint()
-    done = bench.start("doctor", right, "--motion", "-y").finished()
+    done = bench.run("doctor", right, "--motion", "-y", env={**os.environ, "COLUMNS": "200"})
     assert done.code == 0, done.err + done.out
-    assert "the joint moved with the torque" in " ".join(done.out.replace("│", " ").split())
+    assert "the joint moved with the torque" in done.out
     assert bench.disabled()
     wrong = bench.config("wrong.toml", drive__torque_direction=-1)
     done = bench.start("doctor", wrong, "--motion", "-y", "--json").finished()
