@@ -365,11 +365,11 @@ def held_out_rss(problem: Problem, folds: int, seed: int) -> float:
     return total
 
 
-def with_form(problem: Problem, form: Form) -> Problem:
-    """The same points with another model."""
+def with_form(problem: Problem, form: Form, static_max_Nm: float | None = None) -> Problem:
+    """The same points with another model; `static_max_Nm` as of `make_problem`."""
     knee = problem.knee if form.cubic else 1.0
     limit = problem.static_max_Nm
-    if form.cubic != problem.form.cubic:
+    if form.cubic != problem.form.cubic and static_max_Nm is None:
         limit = static_limit_Nm(form, problem.x, problem.y_Nm, knee)
     return replace(problem, form=form, knee=knee, static_max_Nm=limit)
 

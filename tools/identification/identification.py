@@ -373,7 +373,7 @@ def _compared(problems: Sequence[Problem], first: Form, options: Options) -> tup
     for name, form in FORMS.items():
         if form.cubic > first.cubic:
             continue
-        parts = [with_form(problem, form) for problem in problems]
+        parts = [with_form(problem, form, options.static_max_Nm) for problem in problems]
         rmse[name] = float(np.sqrt(sum(project(part).rmse_Nm ** 2 * len(part.x) for part in parts) / total))
         squared = sum(held_out_rss(part, options.folds, options.swarm.seed) for part in parts)
         held_out[name] = float(np.sqrt(squared / total))
@@ -399,7 +399,7 @@ def _fitted(
     warnings: list[str],
 ) -> dict[str, Direction]:
     """The fit of each direction: swarm and polish where the model has a Stribeck stage, else the exact minimum."""
-    problems = [with_form(found.problem, form) for found in points.values()]
+    problems = [with_form(found.problem, form, options.static_max_Nm) for found in points.values()]
     swarms: list[SwarmResult | None] = [None] * len(problems)
     if form.stribeck:
         swarms = list(run_swarms(problems, options.swarm, search_knee=options.search_knee, progress=progress))

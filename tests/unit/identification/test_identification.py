@@ -76,6 +76,18 @@ def test_a_joint_slower_than_the_knee_gets_a_model_without_being_asked():
     assert any("too few for the multi-stage model" in note for note in found.notes)
 
 
+def test_the_greatest_static_friction_that_is_allowed_counts_for_whatever_model_is_chosen():
+    data = paper_data(1)
+    speed_radps = np.abs(data.velocity_radps)
+    torque_Nm = 0.1 + 0.06 * np.exp(-((speed_radps / (3.0 * DEGREE)) ** 2)) + 0.02 * speed_radps
+    torque_Nm += np.random.default_rng(1).normal(scale=1e-3, size=len(torque_Nm))
+    data = replace(data, motor_torque_Nm=torque_Nm * np.sign(data.velocity_radps))
+    found = identify_friction(data, replace(QUICK, static_max_Nm=0.155))
+    assert found.model == "stribeck"  # and not the first one that was tried
+    assert found.branches["positive"].static_Nm <= 0.155 * (1.0 + 1e-9)
+    assert identify_friction(data, QUICK).branches["positive"].static_Nm > 0.157  # the twin
+
+
 @pytest.mark.parametrize(("share", "warned"), [(0.12, False), (0.26, True)])
 def test_too_many_outliers_are_no_outliers_and_it_is_told(share, warned):
     data = paper_data(0, noise_Nm=0.001)
