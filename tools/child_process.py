@@ -80,6 +80,12 @@ class Starting:
             self._tell(f"{self._name} is starting: {so_far} so far, {used_s:.0f} s of processor time")
 
 
+def say(text: str) -> None:
+    """One line on stderr from a process that was started; what nobody reads any more is no reason to end it."""
+    with suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
+
+
 def processors() -> int:
     """How many this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

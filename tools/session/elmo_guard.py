@@ -36,6 +36,7 @@ from jointctl.drivers.elmo.dialogue import (
     usb_serial_number,
 )
 from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.tools.child_process import say
 
 # --- Speaking with the guard of a serial line from another terminal ---
 # The guard listens on an abstract Unix socket named after the device: nothing is left behind, and the kernel tells
@@ -267,7 +268,7 @@ class LineGuard:
                 self._require_same_device()
                 port = SerialPort(order.port, order.baud_rate_bitps)
                 state = switch_off(port, Dialogue(port, order.reply_timeout_s))
-                self._say(f"line guard: the drive on {order.port} is {state}")
+                say(f"line guard: the drive on {order.port} is {state}")
                 return state
             except JointctlError as error:
                 reason = error.message
@@ -276,7 +277,7 @@ class LineGuard:
                     port.close()
             self._close_tty()
             if time.monotonic() > give_up_s:
-                self._say(f"line guard: the drive on {order.port} could not be switched off: {reason}")
+                say(f"line guard: the drive on {order.port} could not be switched off: {reason}")
                 return f"unknown: {reason}"
             time.sleep(REPEAT_S)
 
@@ -285,11 +286,6 @@ class LineGuard:
         known, found = self._order.usb_serial_number, usb_serial_number(self._order.port)
         if known and found and found != known:
             raise BusError(f"another adapter has this name now (serial number {found} instead of {known})")
-
-    @staticmethod
-    def _say(text: str) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            print(text, file=sys.stderr, flush=True)
 
     # --- words from outside ---
 
@@ -335,7 +331,7 @@ def main() -> int:
     try:
         return LineGuard(GuardOrder(**json.loads(sys.argv[1]))).run()
     except JointctlError as error:
-        LineGuard._say(f"line guard: {error}")
+        say(f"line guard: {error}")
         return error.exit_code
 
 

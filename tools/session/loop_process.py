@@ -23,6 +23,7 @@ from pathlib import Path
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.slow_start import slow_start
+from jointctl.tools.child_process import say
 from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 from jointctl.tools.session.loops import loop_of
 from jointctl.tools.wake_up import cores_awake
@@ -64,14 +65,11 @@ def run(order: LoopOrder) -> int:
     port, loop = loop_of(order.kind)
     block = SharedBlock(order.block_fd, order.table_rows, port, order.axes, order.links)
 
-    def tell(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
     gc.disable()
-    with slow_start(tell, "loop"), loop(order, block) as ready:
+    with slow_start(say, "loop"), loop(order, block) as ready:
         gc.freeze()
         for line in become_realtime(order.cpu, order.priority):
-            print(f"loop: {line}", file=sys.stderr, flush=True)
+            say(f"loop: {line}")
         with cores_awake():  # where that is refused, `doctor` says so
             block.words[Word.READY] = 1
             while block.words[Word.GO] == 0:
@@ -117,11 +115,11 @@ def main() -> int:
     try:
         return run(LoopOrder(**json.loads(sys.argv[1])))
     except JointctlError as error:
-        print(f"loop: {error}", file=sys.stderr, flush=True)
+        say(f"loop: {error}")
         return error.exit_code
     except BaseException as error:
         text = " ".join(str(error).split())
-        print(f"loop: {type(error).__name__}{_place(error)}: {text}", file=sys.stderr, flush=True)
+        say(f"loop: {type(error).__name__}{_place(error)}: {text}")
         return 1
 
 

@@ -9,7 +9,6 @@ import contextlib
 import gc
 import os
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.cycle import Exchange, Word
 from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.tools.child_process import say
 from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def portable_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     check_portable_rate(order.interface, rate_Hz)
     warm_up()
     held_Hz = held_rate_Hz(order.receive_ns / order.period_ns)
-    print(f"loop: {portable_note(order.interface, rate_Hz, held_Hz)}", file=sys.stderr, flush=True)
+    say(f"loop: {portable_note(order.interface, rate_Hz, held_Hz)}")
 
     with contextlib.ExitStack() as stack:
 

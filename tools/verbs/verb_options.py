@@ -14,7 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial, wraps
 from importlib import resources
@@ -27,7 +27,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.slow_start import slow_start
-from jointctl.tools.output import Output
+from jointctl.tools.output import Output, abandon
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
@@ -199,6 +199,11 @@ def _with_units(parse: Callable[..., Any], args: list[str]) -> Any:
 class Verb(TyperCommand):
     """A flag shows no type in the help; a number whose name has a unit may be given in another one."""
 
+    def format_help(self, *args: Any) -> None:
+        """The page of help."""
+        with suppress(SystemExit):  # of rich, which drops what nobody reads any more, and would end with 1
+            super().format_help(*args)
+
     def make_parser(self, ctx: Any) -> Any:
         """The parser, and then the units."""
         parser = super().make_parser(ctx)
@@ -220,17 +225,29 @@ def _interruption_kept() -> Iterator[None]:
 
 
 class Verbs(TyperGroup):
-    """A flag shows no type in the help; an interruption is one for the program."""
+    """A flag shows no type in the help; an interruption is one for the program, and so is a broken pipe."""
+
+    def format_help(self, *args: Any) -> None:
+        """The page of help."""
+        with suppress(SystemExit):  # as of a verb
+            super().format_help(*args)
 
     def make_context(self, *args: Any, **keywords: Any) -> Any:
         """What was given on the command line, which may be a configuration."""
         with _interruption_kept():
-            return super().make_context(*args, **keywords)
+            try:
+                return super().make_context(*args, **keywords)
+            except BrokenPipeError:  # of the version, or of a shell's completion
+                abandon(sys.stdout)
+                raise typer.Exit from None
 
     def invoke(self, ctx: Any) -> Any:
         """The verb."""
         with _interruption_kept():
-            return super().invoke(ctx)
+            try:
+                return super().invoke(ctx)
+            except BrokenPipeError as error:  # no stream of `Output`; Typer would end with 1, and no word
+                raise RuntimeError(str(error)) from error
 
     def get_params(self, ctx: Any) -> Any:
         """Those that a page of help shows."""

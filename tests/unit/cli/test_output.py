@@ -288,6 +288,16 @@ def test_what_nobody_reads_is_thrown_away(unread: IO[str], stream: str, json_wan
     output.error("four", "five")
 
 
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [(["--help"], 0), (["run", "--help"], 0), (["--version"], 0), (["--show-completion", "bash"], 0), (["params"], 2)],
+)
+def test_help_that_nobody_reads_ends_like_any_other(unread: IO[str], words: list[str], code: int) -> None:
+    command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", *words]
+    done = subprocess.run(command, stdout=unread, stderr=subprocess.PIPE, text=True, timeout=60.0)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
 def test_one_that_comes_bit_by_bit_ends_when_nobody_reads_it(unread: IO[str]) -> None:
     assert not Output(stdout=unread, stderr=io.StringIO()).line("a frame")
     assert output_to()[0].line("a frame")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 from jointctl.drivers import errors
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
@@ -24,6 +25,7 @@ from jointctl.tools.verbs import doctor, run, start, sweep, verb_options
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
+from jointctl.tools.verbs.verb_options import Verb, Verbs
 from tests.configurations import shipped
 from tests.places import ROOT
 from tests.sessions import Terminal, output
@@ -103,6 +105,18 @@ def test_an_unexpected_error_is_one_line(
     stopped.seen = True  # a library has made this error of the KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt):
         main_module.main()
+
+
+def test_a_broken_pipe_in_a_verb_is_no_silent_end() -> None:
+    app = typer.Typer(cls=Verbs)
+
+    @app.command(cls=Verb)
+    def one() -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    app.callback()(lambda: None)
+    with pytest.raises(RuntimeError, match="Broken pipe"):
+        app(["one"], standalone_mode=False)
 
 
 def test_what_the_encoding_of_the_terminal_lacks_is_escaped(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from jointctl.drivers.elmo.dialogue import SWITCH_OFF
 from jointctl.drivers.errors import BusError, NoDeviceError
 from jointctl.firmware_py.cycle import WORDS, Word
 from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.child_process import say
 from jointctl.tools.session import elmo_guard
 from jointctl.tools.session.elmo_drive import SPARE_S
 from jointctl.tools.session.elmo_guard import (
@@ -385,14 +386,14 @@ def test_the_program_takes_its_order_as_it_was_given(world: Guarded, monkeypatch
 def test_words_that_nobody_can_read_any_more_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", open(os.devnull, "w"))  # noqa: SIM115
     sys.stderr.close()
-    LineGuard._say("nobody")
+    say("nobody")
 
 
 def test_words_are_out_before_the_process_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     flushed = []
     stream = SimpleNamespace(write=lambda text: None, flush=lambda: flushed.append(True))
     monkeypatch.setattr(sys, "stderr", stream)
-    LineGuard._say("now")
+    say("now")
     assert flushed == [True]
 
 

@@ -10,7 +10,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import can
 import pytest
@@ -398,6 +400,16 @@ def test_a_loop_whose_supervisor_goes_before_the_bus_is_there_ends(
     given = replace(LoopOrder(**json.loads(order("jointctl", 1_000_000, block))), supervisor_pid=-1)
     with pytest.raises(BusError, match="before the bus was there"), loops.compiled_loop(given, block):
         pass
+
+
+def test_what_nobody_reads_any_more_does_not_end_the_process(
+    block: SharedBlock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_process, "_block_signals", lambda: None)
+    monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
+    monkeypatch.setattr(sys, "argv", ["loop", order("udp_multicast", 10_000_000, block)])
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(write=Mock(side_effect=BrokenPipeError)))
+    assert loop_process.main() == BusError.exit_code  # after its note about the plain Python loop
 
 
 def test_an_unexpected_exception_is_one_line_too(
