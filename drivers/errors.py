@@ -7,6 +7,7 @@ or empty.
 
 from __future__ import annotations
 
+import errno
 import re
 from typing import ClassVar
 
@@ -93,6 +94,13 @@ class JointctlError(Exception):
 
     def __str__(self) -> str:
         return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+def refused_by_system(error: OSError) -> JointctlError:
+    """What no file, bus or device is to blame for, in one line."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return JointctlError(f"open files: {error.strerror}", "raise the limit, such as `ulimit -n 1024`")
+    return JointctlError(f"{error.filename or 'the operating system'}: {error.strerror or error}")
 
 
 class UsageError(JointctlError):

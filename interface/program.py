@@ -28,6 +28,7 @@ from jointctl.firmware_py.states import AxisPhase, TrajectoryKind, in_words
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, usual_domain
 from jointctl.tools.session.set_points import Numbers, SetPointError, SetPointStream, finite
+from jointctl.tools.verbs.start import require_descriptors
 
 if TYPE_CHECKING:
     from jointctl.tools.child_process import OwnVirtualJoint
@@ -134,6 +135,7 @@ class NewMotion(NamedTuple):
 def motor_of(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted, *, lockstep: bool) -> Motor:
     """The motor for what `Joint` or `Arm` (`kind`) was given; stops of its own count from here on."""
     asked_ns = now_ns()  # what is loaded below takes seconds
+    require_descriptors()
     source, options = wanted_source(config, kind, wanted)
     if lockstep:
         if options.foxglove is not None or options.ros2 is not None:

@@ -73,7 +73,7 @@ def _function(name: str) -> Callable[..., object]:
     from typer.models import ArgumentInfo
 
     from jointctl.drivers.stop_note import asked, now_ns
-    from jointctl.tools.verbs.start import occupy_standard_streams
+    from jointctl.tools.verbs.start import occupy_standard_streams, require_descriptors
     from jointctl.tools.verbs.verb_options import option_call
 
     home = import_module(f"jointctl.tools.verbs.{name}")
@@ -99,6 +99,8 @@ def _function(name: str) -> Callable[..., object]:
         values |= {options[key].name: _checked(name, key, value, options[key]) for key, value in given.items()}
         found.clear()
         occupy_standard_streams()
+        if name != "stop":  # which is tried all the same
+            require_descriptors()
         asked(now_ns())
         code = call({"json": False, **values}) or 0
         result = found[-1] if found else None

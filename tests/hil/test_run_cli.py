@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import time
 from typing import Any
@@ -175,6 +176,18 @@ def test_a_run_whose_output_nobody_reads_any_more_goes_on_to_its_end(bench: Any)
     assert started.finished(60.0).code == 0
     assert bench.disabled()
     assert entered(bench.log().records)[-1] is AxisPhase.FINISHED
+
+
+def test_a_log_that_is_removed_in_the_motion_is_told_at_its_end(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    started = bench.start("run", config, "-y").saw("  tracking")
+    shutil.rmtree(bench.folder / "runs")
+    done = started.finished(60.0)
+    assert (done.code, bench.disabled()) == (8, True)
+    (line,) = [line for line in done.err.splitlines() if line.startswith("warning: runs/")]
+    assert line.endswith(".mcap: was removed or renamed during the run: this log is lost")
+    assert "tracking error" in done.out
 
 
 def test_dry_run_commissions_and_moves_nothing(bench: Any) -> None:

@@ -25,7 +25,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -358,7 +358,7 @@ class RunLogWriter:
 
     What was written is in the hands of the operating system at the latest `flush_s` later (checked at each write, so
     write at least that often) and at once after an event.  `clock` [s] is for tests.  `joints`: the names in its joint
-    states, those of an arm in the log of its first joint.
+    states, those of an arm in the log of its first joint.  `DataError` where it cannot be written.
     """
 
     def __init__(
@@ -380,6 +380,16 @@ class RunLogWriter:
             raise DataError(f"{self.path}: exists already, a log is never overwritten") from None
         except OSError as error:
             raise DataError(f"{self.path}: cannot be created: {error.strerror or error}") from None
+        try:
+            with writing(self.path):
+                self._begin(metadata, joints)
+        except DataError:  # nothing is in it
+            with suppress(OSError):
+                self._file.close()
+            self.path.unlink(missing_ok=True)
+            raise
+
+    def _begin(self, metadata: Mapping[str, Mapping[str, str]], joints: tuple[str, ...]) -> None:
         self._mcap = McapFile(self._file, self.path.parent, profile="ros2", library="jointctl")
         clocks = _clock_metadata()
         self._offset_ns = calendar_offset_ns(clocks)
@@ -394,7 +404,8 @@ class RunLogWriter:
 
     def _channel(self, topic: Topic) -> int:
         if topic.name not in self._channels:
-            self._channels[topic.name] = self._mcap.add_channel(topic.name, topic.schema, topic.definition)
+            with writing(self.path):
+                self._channels[topic.name] = self._mcap.add_channel(topic.name, topic.schema, topic.definition)
         return self._channels[topic.name]
 
     def _add(self, topic: Topic, times_ns: np.ndarray, messages: np.ndarray, numbers: np.ndarray | int = 0) -> None:
@@ -403,7 +414,9 @@ class RunLogWriter:
         rows["sequence"] = numbers
         rows["cdr"] = CDR_HEADER
         rows["record"] = messages.view(np.ndarray).view(rows.dtype["record"])
-        self._mcap.add_messages(self._channel(topic), times_ns + self._offset_ns, rows)
+        channel = self._channel(topic)
+        with writing(self.path):
+            self._mcap.add_messages(channel, times_ns + self._offset_ns, rows)
 
     def write_records(self, records: np.ndarray) -> None:
         """Append log records, an array of shape (N,) of LogRecord in order of time."""
@@ -436,7 +449,9 @@ class RunLogWriter:
         time_ns = time.monotonic_ns() if time_ns is None else time_ns
         calendar_ns = time_ns + self._offset_ns
         body = event_body(calendar_ns, level, source, text)
-        self._mcap.add_message(self._channel(EVENT_TOPIC), calendar_ns, CDR_HEADER + body)
+        channel = self._channel(EVENT_TOPIC)
+        with writing(self.path):
+            self._mcap.add_message(channel, calendar_ns, CDR_HEADER + body)
         self.flush()
 
     def write_temperature(self, time_ns: int, temperature_degC: float) -> None:
@@ -451,25 +466,30 @@ class RunLogWriter:
 
     def flush(self) -> None:
         self._write_joint_states()
-        self._mcap.flush()
+        with writing(self.path):
+            self._mcap.flush()
         self._flushed_at_s = self._clock()
 
     def close(self) -> None:
         """Finish the file (index and summary); may be called twice."""
         if not self._file.closed:
-            try:
-                self.flush()
-                self._mcap.finish()
-            finally:
-                self._mcap.close()
+            with writing(self.path):
+                try:
+                    self.flush()
+                    self._mcap.finish()
+                finally:
+                    self._mcap.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
-        if value is not None:
-            self.write_event(ERROR, "log", f"{type(value).__name__}: {value}")
-        self.close()
+        with suppress(DataError) if value is not None else nullcontext():  # what has ended the run goes before
+            try:
+                if value is not None:
+                    self.write_event(ERROR, "log", f"{type(value).__name__}: {value}")
+            finally:
+                self.close()
 
 
 # --- The folder of the run logs: a name for a new one, room for it, the oldest ones removed (`[log] keep`) ---

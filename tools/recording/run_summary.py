@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.table import Column, Table
@@ -23,6 +24,7 @@ from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, TEAL, VIOLET, canvas, save_png
 from jointctl.tools.recording.run_log import IN_MEMORY
+from jointctl.tools.written_file import writing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -371,35 +373,37 @@ class KeptRecords:
     def __init__(self, folder: Path, in_memory: int = IN_MEMORY) -> None:
         self._folder, self._in_memory = folder, in_memory
         self._parts: list[Any] = []
-        self._count = 0
-        self._file: IO[bytes] | None = None
+        self._count, self._in_file = 0, False
+        with writing(folder):  # now: the folder may be removed or fill before it is needed
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 closed in close()
 
     def __len__(self) -> int:
         return self._count
 
     def append(self, records: np.ndarray) -> None:
-        """Keep `records` (array of LogRecord, shape (N,)); `OSError` if the disk is full."""
+        """Keep `records` (array of LogRecord, shape (N,)); `DataError` if the disk is full."""
         self._count += len(records)
         self._parts.append(records)
-        if self._file is None and self._count <= self._in_memory:
+        self._in_file = self._count > self._in_memory
+        if not self._in_file:
             return
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 closed in close()
-        for part in self._parts:
-            self._file.write(np.ascontiguousarray(part).tobytes())
+        with writing(self._folder):
+            for part in self._parts:
+                self._file.write(np.ascontiguousarray(part).tobytes())
         self._parts.clear()
 
     def records(self) -> Any:
         """All of them: record array of LogRecord, shape (N,); of a long run a view of the file, read-only."""
-        if self._file is None:
+        if not self._in_file:
             kept = np.concatenate(self._parts) if self._parts else np.zeros(0, dtype_of(LogRecord))
             return kept.view(np.recarray)
-        self._file.flush()
+        with writing(self._folder):
+            self._file.flush()
         return np.memmap(self._file, dtype_of(LogRecord), mode="r", shape=(self._count,)).view(np.recarray)
 
     def close(self) -> None:
         """Let go of the file; arrays that `records` has given stay valid."""
-        if self._file is not None:
+        with suppress(OSError):  # what is buffered for a disk that is full is of no use any more
             self._file.close()
 
     def __enter__(self) -> Self:

@@ -425,7 +425,7 @@ class ViewerOrders:
         path = self._log_path.with_name(f"{self._log_path.stem}.recording-{self._count}.mcap")
         try:
             self._recording = RunLogWriter(path, self._metadata)
-        except (DataError, OSError) as error:
+        except DataError as error:
             self._tell(WARNING, f"no recording: {error}")
             return
         self._tell(INFO, f"recording {path.name} begun by {who}")
@@ -436,8 +436,8 @@ class ViewerOrders:
         recording, self._recording = self._recording, None
         try:
             recording.close()
-        except OSError as error:
-            how += f", incomplete: {error.strerror or error}"
+        except DataError as error:
+            how += f", incomplete: {error}"
         self._tell(INFO, f"recording {recording.path.name} ended {how}")
 
     def keep(self, records: np.recarray) -> None:
@@ -446,8 +446,8 @@ class ViewerOrders:
             return
         try:
             self._recording.write_records(records)
-        except OSError as error:
-            self._end_recording(f"because it cannot be written: {error.strerror or error}")
+        except DataError as error:
+            self._end_recording(f"because of {error}")
 
     def keep_event(self, event: Event) -> None:
         """As `keep`, for an event."""
@@ -455,8 +455,8 @@ class ViewerOrders:
             return
         try:
             self._recording.write_event(event.level, event.source, event.text, event.time_ns)
-        except OSError as error:
-            self._end_recording(f"because it cannot be written: {error.strerror or error}")
+        except DataError as error:
+            self._end_recording(f"because of {error}")
 
     def __enter__(self) -> Self:
         return self

@@ -93,6 +93,7 @@ class RunResult:
     others: tuple[RunResult, ...] = ()  # the other joints of an arm
     fault_slot_ns: int = 0  # the loop's time of the fault
     fault_value: float = 0.0  # that tripped the limit
+    log_lost: bool = False  # it was removed during the run, which has warned of it
 
     @property
     def joints(self) -> tuple[RunResult, ...]:
@@ -128,15 +129,16 @@ def _first(config: Config | ArmConfig) -> Config:
 def report_run(result: RunResult, output: Output, config: Config | ArmConfig, motion: str = "") -> int:
     """Print and save everything, and a picture of each joint unless log.picture forbids it; returns the exit code.
 
-    That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all else, and
-    what people read before the picture, which takes a second or more.  `DeviceError` where the drive did not confirm
-    that it is off; both outweigh the `DataError` of a result that cannot be written.
+    That is 0, the one of `MotionFault`, of `DataError` where a log is lost, or 130 after an interruption.  The cause of
+    a fault comes before all else, and what people read before the picture, which takes a second or more.
+    `DeviceError` where the drive did not confirm that it is off; both outweigh the `DataError` of a result that cannot
+    be written.
     """
     joints, title = result.joints, run_title(config, motion)
     faulty = [joint.motion_fault() for joint in result.faulty]
     for fault in faulty:
         output.error(fault.message, fault.hint)
-    wanted = joints if _first(config).log.picture else ()
+    wanted = [joint for joint in joints if _first(config).log.picture and not joint.log_lost]
     drawn = {} if output.for_people else {joint.name: _drawn(joint, output, title) for joint in wanted}
     tables = [_table(joint) for joint in joints]
     data = [_data(joint, drawn.get(joint.name)) for joint in joints]
@@ -159,6 +161,8 @@ def report_run(result: RunResult, output: Output, config: Config | ArmConfig, mo
     if faulty:
         return MotionFault.exit_code
     require_off(result.drive_state)
+    if any(joint.log_lost for joint in joints):
+        return DataError.exit_code
     if result.stopped_by:
         whose = "the joints are" if result.others else "the joint is"
         output.note(f"stopped by {result.stopped_by}; {whose} {result.drive_state}")
@@ -172,7 +176,7 @@ def _table(result: RunResult) -> Table:
         table.title = f"Run of {result.name}"
     table.add_row(*result.load_row)
     table.add_row("drive afterwards", result.drive_state)
-    table.add_row("log", str(result.log_path))
+    table.add_row("log", "lost" if result.log_lost else str(result.log_path))
     return table
 
 
@@ -194,6 +198,6 @@ def _data(result: RunResult, picture: Path | None) -> dict[str, Any]:
         "stopped_by": result.stopped_by or None,
         "drive_state": result.drive_state,
         "lost_records": result.lost_records,
-        "log": str(result.log_path),
+        "log": None if result.log_lost else str(result.log_path),
         "picture": None if picture is None else str(picture),
     }

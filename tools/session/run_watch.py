@@ -26,7 +26,7 @@ from jointctl.drivers.can.frames import FRAME_STRUCT
 from jointctl.drivers.can.open import SHARED_INTERFACES, open_python_can
 from jointctl.drivers.can.socketcan import error_frame_text, link_problem, link_state, send_problem, trouble
 from jointctl.drivers.drive import SettingsGuard, Thermometer
-from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.records import AxisConstants, LawConstants
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
@@ -361,7 +361,7 @@ class RunWatch:
         """Viewers can change nothing any more; a recording of theirs ends.  The log gets what is held back of it."""
         self._set_points.end()
         self._orders.__exit__(*exception)
-        with contextlib.suppress(OSError):  # a full disk may be why this ends
+        with contextlib.suppress(DataError):  # a full disk may be why this ends
             self._keep(self._decimated.last())
 
     @property

@@ -16,7 +16,14 @@ import numpy as np
 
 from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
-from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
+from jointctl.drivers.errors import (
+    BusError,
+    DeviceError,
+    JointctlError,
+    MotionFault,
+    NoDeviceError,
+    refused_by_system,
+)
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.child_process import OwnVirtualJoint
@@ -92,6 +99,12 @@ class Session:
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
+        try:
+            return self._run()
+        except OSError as error:  # what writes a file, and what uses a bus, has an error of its own
+            raise refused_by_system(error) from error
+
+    def _run(self) -> RunResult | None:
         config, signals = self._config, self.signals
         self._kind.check_rate(config)
         with (
@@ -126,8 +139,6 @@ class Session:
                 if signals.commanded_ns:  # the frames of that stop look like another controller's
                     raise KeyboardInterrupt from None
                 raise
-            except OSError as error:
-                raise DataError(f"{self.plan.log_path}: cannot be written: {error.strerror or error}") from None
             finally:
                 self.drive_state = self._made_safe(drives)
                 drives.close()
@@ -349,6 +360,9 @@ class Session:
         loop, config = watch.loop, watch.config
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
+        log_path = watch.joint.log_path
+        if log_lost := not log_path.exists():
+            self._output.warning(f"{log_path}: was removed or renamed during the run: this log is lost")
         records = watch.kept.records()
         state = loop.block.state[0]
         fault, value = loop.verdict()
@@ -371,7 +385,8 @@ class Session:
             bus_load=bus_load,
             load_row=self._kind.load_row(bus_load),
             lost_records=loop.lost_records,
-            log_path=watch.joint.log_path,
+            log_path=log_path,
+            log_lost=log_lost,
             report=report,
             name=watch.joint.name,
             fault_slot_ns=int(state.fault_slot_ns),

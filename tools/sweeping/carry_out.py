@@ -410,7 +410,7 @@ class MeterDisplay(OnlyShows):
     phase = note
 
     def show(self, snapshot: Snapshot) -> None:
-        """See `Display`; `DataError` or `OSError` where the data cannot be written: the run is over."""
+        """See `Display`; `DataError` where the data cannot be written: the run is over."""
         self._meter.temperature_degC = snapshot.temperature_degC
         self._meter.feed(snapshot.records)
         with contextlib.suppress(OSError):  # the terminal may have been closed

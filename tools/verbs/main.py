@@ -12,7 +12,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError, one_line
+from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError, one_line, refused_by_system
 from jointctl.tools.output import Output, abandon, let_go
 from jointctl.tools.scoping.remote_options import with_values
 from jointctl.tools.verbs.check import check
@@ -143,7 +143,8 @@ def _end_unexpected(error: Exception) -> NoReturn:
     if os.environ.get(TRACEBACK):
         raise error
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-        Output().error(f"open files: {error.strerror}", "raise the limit, such as `ulimit -n 1024`")
+        refused = refused_by_system(error)
+        Output().error(refused.message, refused.hint)
     elif isinstance(error, MemoryError):
         Output().error("there is too little memory for this", "end other programs, or give it less to do")
     else:

@@ -117,22 +117,33 @@ def main() -> None:
 
 def _require_descriptors() -> None:
     """Ends the program where too few files can be opened; a stop is tried all the same."""
-    if sys.argv[1:2] == ["stop"]:
-        return
+    if sys.argv[1:2] != ["stop"] and (lacking := lacking_descriptors()):
+        sys.stderr.write("error: {}\nhint: {}\n".format(*lacking))
+        sys.exit(1)
+
+
+def lacking_descriptors() -> tuple[str, str] | None:
+    """What is wrong where too few files can be opened, and what to do about it; else None."""
     opened: list[int] = []
     try:
         while len(opened) < FREE_DESCRIPTORS:
             opened.append(os.open(os.devnull, os.O_RDONLY))
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
-            sys.stderr.write(
-                f"error: open files: {len(opened)} more may be opened, at least {FREE_DESCRIPTORS} are needed\n"
-                "hint: raise the limit, such as `ulimit -n 1024`\n"
-            )
-            sys.exit(1)
+            text = f"open files: {len(opened)} more may be opened, at least {FREE_DESCRIPTORS} are needed"
+            return text, "raise the limit, such as `ulimit -n 1024`"
     finally:
         for descriptor in opened:
             os.close(descriptor)
+    return None
+
+
+def require_descriptors() -> None:
+    """For a program: `JointctlError` where too few files can be opened."""
+    if lacking := lacking_descriptors():
+        from jointctl.drivers.errors import JointctlError
+
+        raise JointctlError(*lacking)
 
 
 def never_refuse_a_character() -> None:

@@ -48,6 +48,21 @@ def test_importing_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True).stdout == "[]\n"
 
 
+@pytest.mark.parametrize(
+    "call", ["Joint('virtual')", "Joint('virtual', lockstep=True)", "Arm('virtual', lockstep=True)", "check('virtual')"]
+)
+def test_too_few_files_may_be_opened(call: str) -> None:
+    code = (
+        "import jointctl, resource; jointctl.Joint, jointctl.Arm, jointctl.check, jointctl.JointctlError\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (30, 30))\n"
+        f"try: jointctl.{call}\n"
+        "except jointctl.JointctlError as error: print(type(error).__name__, error.message)"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)
+    assert done.stdout.startswith("JointctlError open files: "), done.stderr
+    assert "more may be opened, at least 32 are needed" in done.stdout
+
+
 def test_the_processes_of_a_study_do_not_run_the_users_program_again(tmp_path: Path) -> None:
     """It may have moved a joint before, and need not protect what it does by a condition on its name."""
     program = tmp_path / "program.py"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import itertools
 import os
+import resource
 import signal
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -253,7 +256,7 @@ def test_an_index_that_cannot_be_read_back_is_an_error_of_the_disk(
         records = new(LogRecord, 1)
         records.time_ns = cycle
         log.write_records(records)
-    with pytest.raises(OSError, match="index of its chunks cannot be read back"):
+    with pytest.raises(DataError, match=r"log\.mcap: .* index of its chunks cannot be read back"):
         log.close()
     log.close()
     read = read_run_log(tmp_path / "log.mcap")
@@ -389,6 +392,58 @@ def test_an_exception_is_logged_and_the_file_finished(tmp_path: Path) -> None:
     assert read.complete
     assert len(read.records) == 2
     assert read.events[-1].text == "RuntimeError: bus off"
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """What a process without room sees: a file cannot grow beyond so many bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_log_without_room_is_named_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    with largest_file(16), pytest.raises(DataError, match=r"run\.mcap: cannot be written: File too large"):
+        RunLogWriter(tmp_path / "run.mcap", {"a": {"b": "c" * 10_000}})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("write", ["write_records", "flush", "write_event", "close"])
+def test_each_way_of_writing_names_the_log(tmp_path: Path, write: str) -> None:
+    log = RunLogWriter(tmp_path / "run.mcap", {})
+    log.write_records(sample_records(5000 if write == "write_records" else 100)[:-1])
+    values = {"write_records": (sample_records(5000),), "write_event": (30, "test", "full")}.get(write, ())
+    with largest_file(4096), pytest.raises(DataError, match=r"run\.mcap: cannot be written: File too large"):
+        getattr(log, write)(*values)
+    with suppress(DataError):
+        log.close()
+
+
+def test_what_has_ended_a_run_goes_before_a_log_without_room(tmp_path: Path) -> None:
+    def run_that_fails() -> None:
+        with largest_file(4096), RunLogWriter(tmp_path / "a.mcap", {}) as log:
+            log.write_records(sample_records(100))
+            raise RuntimeError("bus off")
+
+    with pytest.raises(RuntimeError, match="bus off"):
+        run_that_fails()
+
+
+def test_kept_records_need_no_folder_any_more(tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    with KeptRecords(folder, in_memory=3) as kept:
+        folder.rmdir()
+        kept.append(sample_records(10))
+        assert len(kept.records()) == 10
+
+
+def test_kept_records_without_room_name_their_folder(tmp_path: Path) -> None:
+    with largest_file(16), KeptRecords(tmp_path, in_memory=3) as kept, pytest.raises(DataError, match="File too large"):
+        kept.append(sample_records(5000))
 
 
 @pytest.mark.parametrize("content", [b"", b"time_s,position_rad\n", bytes(100)])

@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from jointctl.drivers import bus_lock, stop_note
 from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name, wait_for_answers
-from jointctl.drivers.errors import BusError
+from jointctl.drivers.errors import BusError, JointctlError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import Fault, StopRequest
@@ -36,8 +37,25 @@ from jointctl.tools.session.control import (
     stop_signals,
     stop_within_s,
 )
-from jointctl.tools.session.session import NOTED_WITHIN_NS, came_before
+from jointctl.tools.session.session import NOTED_WITHIN_NS, Session, came_before
 from jointctl.tools.verbs.start import Interruption
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(24, "Too many open files"), "open files: Too many open files"),
+        (OSError(12, "Cannot allocate memory"), "the operating system: Cannot allocate memory"),
+        (PermissionError(13, "Permission denied", "/dev/shm/x"), "/dev/shm/x: Permission denied"),
+    ],
+)
+def test_what_the_system_refuses_a_run_is_not_blamed_on_its_log(
+    monkeypatch: pytest.MonkeyPatch, error: OSError, line: str
+) -> None:
+    monkeypatch.setattr(Session, "_run", Mock(side_effect=error))
+    with pytest.raises(JointctlError) as raised:
+        Session.__new__(Session).run()
+    assert (raised.type, raised.value.message) == (JointctlError, line)
 
 
 # --- A program's right to a joint: what its stops ask for, and how long it may take to end ---

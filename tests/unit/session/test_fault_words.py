@@ -392,6 +392,15 @@ def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Pat
     assert "picture " not in out.getvalue()
 
 
+def test_a_log_that_is_lost_has_an_exit_code_and_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_report, "save_run_figure", lambda *_: pytest.fail("it would be beside the log"))
+    for fault, code in ((Fault.NONE, 8), (Fault.BUS_ERROR, 7)):
+        out = io.StringIO()
+        found = replace(result(tmp_path, fault), log_lost=True)
+        assert run_report.report_run(found, Output(json=True, stdout=out, stderr=io.StringIO()), CONFIG) == code
+        assert json.loads(out.getvalue())["log"] is None
+
+
 def reported_to_a_full_disk(found: RunResult) -> int:
     with Path("/dev/full").open("w") as full:
         return run_report.report_run(found, Output(stdout=full, stderr=io.StringIO()), WITHOUT_PICTURE)
