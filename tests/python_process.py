@@ -1,12 +1,14 @@
-"""Beside other processes: what a command leaves, Python code that must end well, waiting, children."""
+"""Beside other processes: what a command leaves, Python code that must end well, waiting, children, no room."""
 
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -64,3 +66,14 @@ def child(parent: int, module: str) -> int:
     """The direct child that runs this module; ValueError if there is none."""
     (pid,) = [pid for pid in children(parent) if module in Path(f"/proc/{pid}/cmdline").read_text()]
     return pid
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """What a process without room sees: a file cannot grow beyond so many bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

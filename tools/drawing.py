@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 from jointctl.drivers.errors import UsageError, printable
-from jointctl.tools.written_file import refuse_overwriting, refuse_special, writing
+from jointctl.tools.written_file import refuse_overwriting, refuse_special, replace_file, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,6 +136,5 @@ def save_png(figure: Figure, path: Path) -> Path:
     """`png` into a file, whose folder is made; returns the path.  `DataError` if it cannot be written."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        refuse_special(path)
-        path.write_bytes(png(figure))
+    replace_file(path, png(figure))
     return path

@@ -1,4 +1,4 @@
-"""Files that a command writes: refused before the work begins, and put in place in one step."""
+"""Files that a command writes: refused before the work begins, and put in place in one step or not at all."""
 
 from __future__ import annotations
 
@@ -98,12 +98,16 @@ def prepare_target(file: Path | None) -> None:
 
 
 def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:
-    """Write a new file beside `path`, let `check` read it, then put it in place in one step."""
-    path = path.resolve()
+    """Write a new file beside `path`, let `check` read it, then put it in place in one step.
+
+    `DataError` if it cannot be written: then `path` is as it was, and nothing is beside it.
+    """
     refuse_special(path)
     refuse_read_only(path)
     with writing(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+        target = path.resolve()
+        prefix = f".{target.stem[:_LONGEST_STEM]}."
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=target.suffix, dir=target.parent)
     temporary = Path(name)
     try:
         with writing(path):
@@ -113,13 +117,13 @@ def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | Non
                 os.fsync(stream.fileno())
             if check is not None:
                 check(temporary)
-            if path.exists():
-                shutil.copymode(path, temporary)
+            if target.exists():
+                shutil.copymode(target, temporary)
             else:
                 mask = os.umask(0)
                 os.umask(mask)
                 temporary.chmod(0o666 & ~mask)
-            os.replace(temporary, path)
+            os.replace(temporary, target)
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -513,4 +514,6 @@ class ParameterStore:
             new.write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
             os.replace(new, self._path)
         except OSError:
+            with contextlib.suppress(OSError):
+                new.unlink()
             raise SdoAbort(HARDWARE) from None

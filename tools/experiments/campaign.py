@@ -29,6 +29,7 @@ from jointctl.tools.experiments.judge import Verdict, judge
 from jointctl.tools.experiments.many_runs import HERE, Workers
 from jointctl.tools.lockstep import LockstepArm, LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
+from jointctl.tools.written_file import replace_file
 
 # --- the runs ---
 
@@ -188,7 +189,7 @@ def write_json(
         "violations": found,
     }
     text = json.dumps(content, indent=1, allow_nan=False)
-    path.write_text(text + "\n")
+    replace_file(path, f"{text}\n".encode())
 
 
 def campaign_figure(verdicts: Sequence[Verdict], velocity_max_radps: float) -> Any:

@@ -22,6 +22,7 @@ does not depend on the number of processes.  A study comes from flags and from a
 from __future__ import annotations
 
 import csv
+import io
 import math
 import tomllib
 from collections.abc import Callable
@@ -75,7 +76,7 @@ from jointctl.tools.experiments.scenarios import (
     run_scenario,
 )
 from jointctl.tools.lockstep import LockstepJoint
-from jointctl.tools.written_file import writing
+from jointctl.tools.written_file import replace_file, writing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -490,17 +491,17 @@ def run_study(
 
 def write_csv(result: StudyResult, path: Path) -> None:
     """One line for each run."""
-    names = [field.name for field in fields(ErrorFigures)]
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(
+        ["plant", "friction_kind", "encoder_bits", "controller", *(field.name for field in fields(ErrorFigures))]
+    )
+    for plant in result.plants:
+        for name, figures in zip(result.controllers, plant.figures, strict=True):
+            writer.writerow([plant.index, plant.friction_kind, plant.encoder_bits, name, *asdict(figures).values()])
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["plant", "friction_kind", "encoder_bits", "controller", *names])
-            for plant in result.plants:
-                for name, figures in zip(result.controllers, plant.figures, strict=True):
-                    writer.writerow(
-                        [plant.index, plant.friction_kind, plant.encoder_bits, name, *asdict(figures).values()]
-                    )
+    replace_file(path, text.getvalue().encode())
 
 
 # --- box plots, logarithmic ---

@@ -14,6 +14,7 @@ import json
 import os
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ from jointctl.tools.recording.report_page import (
     write_verb_page,
 )
 from jointctl.tools.sweeping.carry_out import MeasuredPoint
-from jointctl.tools.written_file import writing
+from jointctl.tools.written_file import replace_file, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -50,9 +51,7 @@ def _heading(sidecar: dict[str, Any]) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    replace_file(path, text.encode())
 
 
 class SweepFile:
@@ -96,9 +95,12 @@ class SweepFile:
         sidecar = sidecar_contents(
             reduction_ratio, torque_constant_NmpA, plan=plan, measured=[], elapsed_s=0.0, unsettled={}, **more
         )
-        with writing(path):
+        _replace(path, _heading(sidecar))
+        try:
             _replace(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
-            path.write_text(_heading(sidecar), encoding="ascii")
+        except DataError:
+            path.unlink()
+            raise
         return cls(path, sidecar, torque_constant_NmpA)
 
     @classmethod
@@ -170,7 +172,8 @@ class SweepFile:
     def close(self) -> None:
         """Files without one row are removed: nothing was measured, and they would be in the way of the next try."""
         self._to_disk.shutdown()
-        self._stream.close()
+        with suppress(OSError):  # a full disk, which `add` has told
+            self._stream.close()
         if not self._sidecar["measured"]:
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(".json").unlink(missing_ok=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import rmtree
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated
 
@@ -132,15 +133,20 @@ def _new_arm(folder: Path, output: Output) -> int:
 
 
 def _write_folder(folder: Path, files: Mapping[str, bytes], output: Output) -> None:
+    with writing(folder):
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise DataError(f"{folder}: exists already, a configuration is never overwritten") from None
     try:
-        folder.mkdir(parents=True)
         for name, content in files.items():
-            (folder / name).write_bytes(content)
-            output.note(f"written: {folder / name}")
-    except FileExistsError:
-        raise DataError(f"{folder}: exists already, a configuration is never overwritten") from None
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
+            with writing(folder):
+                (folder / name).write_bytes(content)
+    except DataError:
+        rmtree(folder, ignore_errors=True)  # half of it would count as a configuration of the user
+        raise
+    for name in files:
+        output.note(f"written: {folder / name}")
 
 
 def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, ask: bool) -> int:

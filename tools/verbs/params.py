@@ -50,7 +50,7 @@ def dump(
 ) -> int:
     """Read every readable object of the EDS.  Reads only."""
     from jointctl.tools.inspection.parameters import dcf_text
-    from jointctl.tools.written_file import writing
+    from jointctl.tools.written_file import replace_file
 
     if out is not None and out.suffix.lower() != ".dcf":
         raise DataError(f"{out}: the name of a dump must end in .dcf: parameters are written as DCF only")
@@ -59,8 +59,7 @@ def dump(
     found, objects = parameters_of_drive(subject, output)
     text = dcf_text(found, objects.required())
     if out is not None:
-        with writing(out):
-            out.write_text(text, encoding="utf-8")
+        replace_file(out, text.encode())
         output.note(
             f"{out}: {len(found.parameters)} parameters, {len(found.readings)} readings, "
             f"{len(found.unreadable)} objects could not be read"

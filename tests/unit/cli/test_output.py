@@ -9,28 +9,36 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.experiments.controller_study import StudySettings
+from jointctl.tools.drawing import save_png
+from jointctl.tools.experiments.campaign import write_json
+from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, StudySettings, write_csv
+from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output, width_of
 from jointctl.tools.recording.report_page import Details, Paragraph, Section, draw, page
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.recording.run_log import INFO, Event
 from jointctl.tools.scoping.history import History
 from jointctl.tools.session.display import LivePanel
+from jointctl.tools.sweeping.data_file import SweepFile
 from jointctl.tools.verbs import study as study_module
 from jointctl.tools.verbs.info import info_table
+from jointctl.tools.verbs.new import new
 from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target
+from tests.python_process import largest_file
 from tests.sessions import Terminal
 from tests.sessions import output as output_to
 
@@ -407,3 +415,41 @@ def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path, kind: str) -> No
             refused(path)
     after = os.stat(path)
     assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
+
+
+PLANTS = (PlantResult(0, "lugre", 17, (ErrorFigures(*(0.0 for _ in fields(ErrorFigures))),)),) * 500
+
+
+def drawing() -> Figure:
+    """More than a block of a disk."""
+    figure = Figure()
+    figure.subplots(2, 2)
+    return figure
+
+
+@pytest.mark.parametrize("before", [None, b"of the last time"])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: replace_file(path, bytes(5000)),
+        lambda path: save_png(drawing(), path),
+        lambda path: write_csv(StudyResult(("paper",), PLANTS, False), path),
+        lambda path: write_json(path, 1, [], 0.0, "run", [{"kind": "x" * 5000}]),
+        lambda path: SweepFile.create(path, 121.0, 0.1, "plan", {"more": "x" * 5000}),
+    ],
+)  # fmt: skip
+def test_a_full_disk_leaves_what_was_there_and_nothing_beside_it(
+    tmp_path: Path, write: Callable[[Path], object], before: bytes | None
+) -> None:
+    path = tmp_path / "out.csv"
+    if before is not None:
+        path.write_bytes(before)
+    with largest_file(4096), pytest.raises(DataError):
+        write(path)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == ({"out.csv": before} if before else {})
+
+
+def test_half_an_arm_does_not_stay(tmp_path: Path) -> None:
+    with largest_file(4096), pytest.raises(DataError, match="arm: cannot be written: File too large"):
+        new(tmp_path / "arm", output_to()[0], arm=True)
+    assert not list(tmp_path.iterdir())

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import os
-import resource
 import signal
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from jointctl.tools.recording.ros_messages import RECORD_TOPIC, event_body, even
 from jointctl.tools.recording.run_log import CHUNK_BYTES, INFO, McapFile, RunLogWriter, ThinnedRecords, message_rows
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.recording.run_summary import KeptRecords
+from tests.python_process import largest_file
 from tests.run_records import sample_records
 
 
@@ -392,17 +391,6 @@ def test_an_exception_is_logged_and_the_file_finished(tmp_path: Path) -> None:
     assert read.complete
     assert len(read.records) == 2
     assert read.events[-1].text == "RuntimeError: bus off"
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """What a process without room sees: a file cannot grow beyond so many bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_log_without_room_is_named_and_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from jointctl.drivers.canopen.sdo import download
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.tools.virtual_joint import new_device
 from tests.places import CONFIGS, EDS
+from tests.python_process import largest_file
 from tests.two_encoders import NODE as TWO_NODES
 from tests.two_encoders import short_run
 from tests.virtual_drive import NODE, Network, Rig, network_node, virtual_drive
@@ -311,6 +312,13 @@ def test_a_file_that_cannot_be_written_is_a_hardware_error(tmp_path: Path) -> No
     assert rig.write(0x1010, 1, SAVE, 4) == 0x06060000
     restart(rig)
     assert values(rig)[0] == 0
+
+
+def test_half_a_file_does_not_stay(tmp_path: Path) -> None:
+    rig = changed_rig(tmp_path / "joint.json")
+    with largest_file(4):
+        assert rig.write(0x1010, 1, SAVE, 4) == 0x06060000
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"6041:0": 1}', '{"1017:0": "x"}', '{"1017:0": 70000}', '{"nonsense": 1}'])
