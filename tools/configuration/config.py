@@ -164,6 +164,13 @@ class Config(Section):
     def path(self) -> Path:
         return self._path
 
+    def anchored(self) -> Config:
+        """The same wherever the working directory goes: its file and its log folder by their full paths."""
+        folder = os.path.abspath(self.log.folder)
+        found = self.model_copy(update={"log": self.log.model_copy(update={"folder": folder})})
+        found._path = self._path.absolute()
+        return found
+
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the user should know about the file, one line each."""

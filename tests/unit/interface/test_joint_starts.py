@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from pathlib import Path
+from shutil import copytree
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +17,9 @@ from jointctl.drivers.bus_lock import lock_name
 from jointctl.drivers.errors import MotionFault
 from jointctl.drivers.stop_note import now_ns, write_note
 from jointctl.joint import Joint
+from jointctl.program import Wanted, axes_of, wanted_source
+from jointctl.tools.configuration.arm import SHIPPED_ARM
+from jointctl.tools.configuration.load import load_config
 from tests.configurations import written
 
 pytestmark = pytest.mark.usefixtures("old_program")
@@ -66,6 +70,31 @@ def test_a_stop_of_its_own_is_one_of_what_it_has_asked_for_before(
     stop(joint_file)
     with pytest.raises(AssertionError if before else MotionFault):
         (joint or Joint(joint_file)).__enter__()
+
+
+@pytest.mark.parametrize("given", ["virtual.toml", Path("virtual.toml"), load_config])
+def test_where_its_files_are_does_not_change_with_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: Any
+) -> None:
+    """The virtual joint would be that of another file of this name, such as the shipped one."""
+    written(tmp_path / "virtual.toml", "virtual")
+    monkeypatch.chdir(tmp_path)
+    source, _ = wanted_source(given("virtual.toml") if callable(given) else given, "Joint", Wanted(virtual=True))
+    monkeypatch.chdir("/")
+    assert (source.config.path, axes_of(source.config).joints[0].log.folder) == (
+        tmp_path / "virtual.toml", str(tmp_path / "runs"),
+    )  # fmt: skip
+    assert source.own_virtual
+
+
+def test_so_it_is_of_an_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copytree(SHIPPED_ARM.parent, tmp_path / "arm")
+    monkeypatch.chdir(tmp_path)
+    source, _ = wanted_source(Path("arm", SHIPPED_ARM.name), "Arm", Wanted(virtual=True))
+    joints = axes_of(source.config).joints
+    assert source.config.path == tmp_path / "arm" / SHIPPED_ARM.name
+    assert {joint.path.parent for joint in joints} == {tmp_path / "arm"}
+    assert {joint.log.folder for joint in joints} == {str(tmp_path / "runs")}
 
 
 @pytest.mark.parametrize("by", ["", "jointctl stop"])
