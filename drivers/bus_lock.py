@@ -40,7 +40,7 @@ from typing import Any, Self
 from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
-from jointctl.drivers.port_users import program_name
+from jointctl.drivers.port_users import keep_from_forks, program_name
 from jointctl.drivers.stop_note import EXHAUSTED, LOCKS, remove_old, settle, stopped, write_note
 
 # --- Unix sockets between programs of one computer: a name, the process at the other end, lines of JSON ---
@@ -105,9 +105,8 @@ class BusLock:
     """
 
     def __init__(
-        self, interface: str, channel: str, on_stop: Callable[[], None] | None = None,
-        within_s: float = STOP_WITHIN_S,
-    ) -> None:  # fmt: skip
+        self, interface: str, channel: str, on_stop: Callable[[], None] | None = None, within_s: float = STOP_WITHIN_S
+    ) -> None:
         self.marker_fd: int | None = None  # to be handed to every process that acts for this program
         self.remarks: list[str] = []
         self.stopped = False
@@ -137,7 +136,8 @@ class BusLock:
         try:
             self._refuse_others()
             self._starts = False
-            self.marker_fd = os.memfd_create(self._name)
+            self._marker = keep_from_forks(os.fdopen(os.memfd_create(self._name), "rb", buffering=0))
+            self.marker_fd = self._marker.fileno()
             self.stopped = stopped(self._name)
         except BaseException:
             self.close()
@@ -158,7 +158,7 @@ class BusLock:
     def close(self) -> None:
         """Leave the bus to others; may be called twice.  A process that is forked has nothing of it to leave.
 
-        The socket that it inherits wakes the program's own thread: no stop would reach the program any more.
+        The `_woken` that it inherits wakes the program's own thread: no stop would reach the program any more.
         """
         if os.getpid() != self._process:
             return
@@ -169,7 +169,7 @@ class BusLock:
             self._wake.close()
             self._woken.close()
         if self.marker_fd is not None:
-            os.close(self.marker_fd)
+            self._marker.close()
             self.marker_fd = None
 
     def __enter__(self) -> Self:
@@ -182,7 +182,7 @@ class BusLock:
         """The first name that no one has; others may have all of them."""
         for number in range(NAMES):
             try:
-                self._server, self._number = listener(_address(self._name, number)), number
+                self._server, self._number = keep_from_forks(listener(_address(self._name, number))), number
                 return
             except OSError as error:
                 if error.errno != errno.EADDRINUSE:

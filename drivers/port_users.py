@@ -1,10 +1,46 @@
-"""Who has a serial port open, and what a process is called: asked of the system."""
+"""Who has a serial port open, and what a process is called: asked of the system; what a forked process does not get."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeVar
+from weakref import WeakSet
+
+# --- A process that is forked from a controller would keep its locks, also when the controller has gone ---
+
+
+class HasDescriptor(Protocol):
+    """A socket, a file, a port or a bus."""
+
+    def fileno(self) -> int: ...
+
+
+Held = TypeVar("Held", bound=HasDescriptor)
+_held: WeakSet[HasDescriptor] = WeakSet()
+
+
+def keep_from_forks(held: Held) -> Held:
+    """The same; processes that are forked have the null device in its place, its number stays theirs to close."""
+    _held.add(held)
+    return held
+
+
+def _let_go() -> None:
+    null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    for held in list(_held):
+        with contextlib.suppress(OSError, ValueError):  # closed already
+            os.dup2(null, held.fileno(), inheritable=False)
+    os.close(null)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
+
+
+# --- Who has a port ---
 
 # who has one of these keeps up a pseudo-terminal, as `jointctl hil --serial` does, and is no user of it
 _TERMINAL_MAKERS = {"/dev/ptmx", "/dev/pts/ptmx"}

@@ -29,7 +29,7 @@ import can
 
 from jointctl.drivers.can import socketcan, virtual_bus
 from jointctl.drivers.errors import BusError
-from jointctl.drivers.port_users import users_text
+from jointctl.drivers.port_users import keep_from_forks, users_text
 
 Option = str | int | float | bool
 RESERVED = frozenset(("interface", "channel", "bitrate", "can_filters", "ignore_config", "config_context", "context"))
@@ -273,6 +273,7 @@ def open_python_can(
                 bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
             if exclusive and "://" not in channel:
                 lock_port(bus.fileno(), port_path(channel))
+                keep_from_forks(bus)
             return normalised(bus)
         return normalised(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError

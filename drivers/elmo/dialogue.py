@@ -31,7 +31,7 @@ import serial
 from serial.tools import list_ports
 
 from jointctl.drivers.errors import BusError, DeviceError, JointctlError, NoDeviceError
-from jointctl.drivers.port_users import users_text
+from jointctl.drivers.port_users import keep_from_forks, users_text
 
 # --- The drive's numbers: error codes (EC), motor fault (MF), status register (SR), unit modes (UM) in words ---
 # Source: the command reference of the drive family as far as two public drivers and the project's facts sheet state it.
@@ -183,6 +183,7 @@ class SerialPort:
             )
         except (serial.SerialException, OSError, ValueError, termios.error) as error:
             raise _open_error(path, baud_rate_bitps, error) from None
+        keep_from_forks(self._serial)
 
     def write(self, data: bytes) -> None:
         with self._failures():

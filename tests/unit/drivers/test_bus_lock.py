@@ -36,6 +36,7 @@ from jointctl.drivers.bus_lock import (
 )  # fmt: skip
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
+from tests.python_process import forked
 
 
 @pytest.fixture
@@ -553,6 +554,15 @@ def test_a_forked_process_leaves_the_lock_to_its_program(channel: str) -> None:
         with asked(channel, "stop") as holder:
             assert holder.is_controller
     assert stops
+
+
+def test_a_forked_process_does_not_keep_the_bus_nor_is_it_ended_by_a_stop(channel: str) -> None:
+    with BusLock("socketcan", channel), forked() as child:
+        assert not is_marked(child, lock_name("socketcan", channel))
+    with ExitStack() as stack:
+        with BusLock("socketcan", channel):
+            stack.enter_context(forked())
+        assert BusLock("socketcan", channel).close() is None
 
 
 def test_no_descriptor_is_left_behind(channel: str) -> None:

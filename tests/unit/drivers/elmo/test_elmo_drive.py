@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
+import pty
 import re
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -17,6 +19,7 @@ from jointctl.drivers.elmo.settings import cycle_characters, highest_rate_Hz, me
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.hil.elmo_drive import switch_off
 from jointctl.tools.verbs.elmo_bench import SHARED_ATTEMPTS, PortTarget
+from tests.python_process import forked
 from tests.unit.drivers.elmo.virtual_line import COUNTS, SETTINGS, MemoryPort
 
 Answer = Callable[[bytes, bytes], bytes]
@@ -428,3 +431,14 @@ class TestSerialPort:
         file.write_text("")
         with pytest.raises(BusError, match="not a serial port"):
             SerialPort(str(file), 115_200)
+
+    def test_a_forked_process_does_not_keep_it(self) -> None:
+        master, slave = pty.openpty()
+        first = SerialPort(os.ttyname(slave), 115_200)
+        with pytest.raises(BusError):
+            SerialPort(os.ttyname(slave), 115_200)
+        with forked():
+            first.close()
+            SerialPort(os.ttyname(slave), 115_200).close()
+        os.close(master)
+        os.close(slave)
