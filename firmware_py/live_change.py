@@ -249,10 +249,10 @@ def step_new_motion(constants: AxisConstants, state: AxisState, table: np.ndarra
     if state.trajectory_s < 0.0:
         approach_at(state.approach, state.trajectory_s + change.move_s, state.reference)
         return
-    change.motion = MotionChange.NONE
     constants.trajectory = change.next_trajectory
     reset_learning(state.law.learning)  # what was learned belongs to the motion before; its torque has faded out
     state.table_row = reference_at(constants.trajectory, table, 0, state.trajectory_s, state.reference)
+    change.motion = MotionChange.NONE  # last: who sees that in another process takes the trajectory for the new one
 
 
 # --- Set-points that come while the joint moves: a cubic through them, a little later than they say ---

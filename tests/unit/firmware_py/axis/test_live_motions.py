@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from jointctl.firmware_py import live_change
+from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.live_change import move_duration_s, trajectory_allowed
 from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
@@ -95,6 +98,23 @@ def test_a_sine_begins_at_its_crest_and_the_run_ends_after_its_time(rig: NewRig)
     run.until(AxisPhase.RAMPING)
     assert len(run.phases) - began == pytest.approx(300, abs=2)
     assert run.state.fault == Fault.NONE
+
+
+def test_a_change_has_come_to_its_end_when_the_new_motion_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that waits for its motion reads both in another process, at any moment."""
+    constants = SimpleNamespace(trajectory="before")
+
+    class Change(SimpleNamespace):
+        def __setattr__(self, name: str, value: object) -> None:
+            assert (name, value, constants.trajectory) == ("motion", MotionChange.NONE, "new")
+            super().__setattr__(name, value)
+
+    change = Change(motion=MotionChange.MOVING, next_trajectory="new")
+    state = SimpleNamespace(change=change, trajectory_s=0.0, reference=None, law=SimpleNamespace(learning=None))
+    for name in ("reset_learning", "reference_at"):
+        monkeypatch.setattr(live_change, name, lambda *_: 0)
+    plain(live_change.step_new_motion)(constants, state, np.zeros((0, 5)), 1)
+    assert change.motion == MotionChange.NONE
 
 
 def test_an_overrun_on_the_way_loses_no_time(rig: NewRig) -> None:
