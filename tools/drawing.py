@@ -88,9 +88,15 @@ _POWER = re.compile(r"\$\\mathdefault\{(.*?)\^\{(\S+?)\}\}\$")
 _RAISED = str.maketrans("0123456789-\N{MINUS SIGN}", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁻")
 
 
-def _powers_in_letters(figure: Figure) -> None:
-    """Ticks of logarithmic axes as "10³": formulas are not set (`text.parse_math`), since a name may look like one."""
-    from matplotlib.ticker import LogFormatterMathtext, LogFormatterSciNotation
+FEW_DECADES = 100.0  # between the ends of a logarithmic axis
+
+
+def _label_logarithmic(figure: Figure) -> None:
+    """Powers of ten as "10³": formulas are not set (`text.parse_math`), since a name may look like one.
+
+    On an axis of few decades 1, 2 and 5 of each: there may be no power, and labels of all steps would overlap.
+    """
+    from matplotlib.ticker import LogFormatterMathtext, LogFormatterSciNotation, LogLocator, NullFormatter
 
     class Powers(LogFormatterSciNotation):
         def __call__(self, x: float, pos: int | None = None) -> str:
@@ -99,7 +105,14 @@ def _powers_in_letters(figure: Figure) -> None:
 
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
-            if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+            if not isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+                continue
+            low, high = sorted(axis.get_view_interval())
+            if high < FEW_DECADES * low:
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter(lambda x, _: f"{x:g}" if "e" not in f"{x:g}" else Powers()(x))
+                axis.set_minor_formatter(NullFormatter())
+            else:
                 axis.set_major_formatter(Powers(labelOnlyBase=True))
                 axis.set_minor_formatter(Powers(labelOnlyBase=False))
 
@@ -109,7 +122,7 @@ def save_figure(figure: Figure, target: BinaryIO | TextIO, **how: Any) -> None:
     import matplotlib
     from matplotlib.text import Text
 
-    _powers_in_letters(figure)
+    _label_logarithmic(figure)
     for text in figure.findobj(Text):
         text.set_text(printable(text.get_text(), keep="\n"))
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": how.pop("hashsalt", None)}), warnings.catch_warnings():

@@ -506,7 +506,6 @@ def write_csv(result: StudyResult, path: Path) -> None:
 
 # --- box plots, logarithmic ---
 
-FEW_DECADES = 100.0  # between the ends of an axis
 _PANELS = (
     ("peak_mrad", "peak error [mrad]"),
     ("rmse_mrad", "RMSE [mrad]"),
@@ -516,8 +515,6 @@ _PANELS = (
 
 def study_figure(result: StudyResult, title: str) -> Figure:
     """The boxes: quartiles; whiskers 5 and 95 %; dots beyond."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
     count = len(result.controllers)
     with canvas(1.8 + 0.42 * count, title) as figure:
         axes = figure.subplots(1, len(_PANELS), sharey=True)
@@ -525,11 +522,6 @@ def study_figure(result: StudyResult, title: str) -> Figure:
             _boxes(axis, result, key)
             axis.set_xscale("log")
             axis.set_xmargin(0.04)
-            low, high = axis.get_xlim()
-            if high < FEW_DECADES * low:  # the labels of the steps between them would overlap
-                axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.xaxis.set_major_formatter("{x:g}")
-                axis.xaxis.set_minor_formatter(NullFormatter())
             axis.set_xlabel(label)
             axis.grid(True, which="both", axis="x", linewidth=0.5)
             axis.grid(False, axis="y")

@@ -91,7 +91,7 @@ def test_powers_of_ten_are_letters_and_a_name_with_dollars_is_no_formula() -> No
         "$x$ and \\times",
         "10⁻¹",
         "10⁶",
-        "3\N{MULTIPLICATION SIGN}10⁰",
+        "3",
         "2\N{MULTIPLICATION SIGN}10⁻⁵",
     } <= set(found)
     assert not [words for words in found if "mathdefault" in words]
@@ -110,6 +110,29 @@ def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"a\.png: cannot be written"):
         save_png(small(), tmp_path / "file" / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (3.0, 40.0, ["5", "10", "20"]),
+        (1.2, 6.0, ["2", "5"]),
+        (3e-6, 3e-5, ["5\N{MULTIPLICATION SIGN}10⁻⁶", "10⁻⁵", "2\N{MULTIPLICATION SIGN}10⁻⁵"]),
+        (1.25, 1.55, ["1.25", "1.3", "1.35", "1.4", "1.45", "1.5", "1.55"]),
+        (0.02, 30.0, ["10⁻¹", "10⁰", "10¹"]),
+    ],
+)
+def test_a_logarithmic_axis_has_labels_that_do_not_overlap(low: float, high: float, labels: list[str]) -> None:
+    with canvas(3.0) as figure:
+        axes = figure.subplots()
+        axes.loglog([low, high], [low, high])
+    png(figure)
+    figure.draw_without_rendering()
+    for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+        shown = {tick.get_loc(): tick.label1.get_text() for tick in ticks}
+        within = [text for at, text in sorted(shown.items()) if limits[0] * 0.999 <= at <= limits[1] * 1.001 and text]
+        assert within == labels
 
 
 def test_the_boxes_of_a_study_follow_the_page() -> None:
