@@ -229,11 +229,15 @@ _SCALE_CURE = (
     "then turn the joint by hand by 90 deg with the power off and compare"
 )
 
+_SWAPPED_CURE = "swap encoder.counts_per_turn and joint_encoder.counts_per_turn if the makers' data agree"
+
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
+SAME_PLACE = 0.02  # the same of their positions at standstill
+STOOD = 0.02  # of the way of the other encoder
 LITTLE_WORK = 0.05  # of the largest torque times the farthest way
 FRICTION_FACTOR = 2.5  # measured over configured static friction, either way
 TORQUE_FACTOR = 2.0  # measured over commanded torque, either way
@@ -255,6 +259,9 @@ def judged(config: Config, counts_per_motor_turn: float) -> Finding:
     if any(abs(factor - 1.0) < SCALE_TOLERANCE for factor in factors):
         return Finding("counts", OK, text, "", numbers)
     shown = " or ".join(f"{factor:.4g}" for factor in factors)
+    second = config.joint_encoder
+    if second is not None and abs(second.counts_per_turn / counts_per_motor_turn - 1.0) < SCALE_TOLERANCE:
+        return Finding("counts", NOTE, f"{text}, and so says joint_encoder.counts_per_turn", _SWAPPED_CURE, numbers)
     return Finding("counts", NOTE, f"{text}: {shown} times as many", _SCALE_CURE, numbers)
 
 
@@ -343,6 +350,9 @@ def motion_findings(
     held_cycles = 1 if fault is Fault.POSITION_FROZEN else round(HELD_s * config.loop.rate_Hz)
     motion = motion_of(records, threshold_rad, held_cycles)
     if motion is None:
+        if fault is Fault.POSITION_DISAGREEMENT and len(records) and records.position_rad[-1]:
+            places = float(records.second_position_rad[-1] / records.position_rad[-1])
+            yield from _swapped(config, law, other, places, SAME_PLACE)
         yield ended_finding(records, fault, text)
         return
     numbers = {key: value for key, value in vars(motion).items() if value is not None}
@@ -350,13 +360,15 @@ def motion_findings(
         if fault is Fault.VELOCITY_LIMIT:  # of an encoder that stands still there is none
             yield ended_finding(records, fault, text)
             return
-        yield _standing(motion, law, other, threshold_rad, second is not None, numbers)
+        moved = second is not None and abs(motion.other_moved_rad) > threshold_rad
+        swapped = list(_swapped(config, law, other, motion.other_ratio)) if moved else []
+        yield from swapped or [_standing(motion, law, other, threshold_rad, moved, numbers)]
         if fault is not Fault.NONE and fault not in _STANDING_FAULTS:
             yield ended_finding(records, fault, text)
         return
     along = motion.along or (motion.held_Nm != 0.0 and fault is Fault.NONE)  # it was pulled to and fro, and followed
     loaded = not along and motion.held_Nm != 0.0
-    encoders = list(_encoders(motion, None if loaded else along, law, other)) if second is not None else []
+    encoders = list(_encoders(config, motion, None if loaded else along, law, other)) if second is not None else []
     yield from encoders
     direction = _loaded(motion, numbers) if loaded else _direction(motion, along, law, other, numbers)
     yield direction
@@ -384,11 +396,11 @@ def ended_finding(records: np.recarray, fault: Fault, text: FaultText | None) ->
 
 
 def _standing(
-    motion: Motion, law: str, other: str, threshold_rad: float, two: bool, numbers: dict[str, Any]
+    motion: Motion, law: str, other: str, threshold_rad: float, other_moved: bool, numbers: dict[str, Any]
 ) -> Finding:
     reading = f"the reading of [{law}] stood still (within {threshold_rad * 1e3:.2g} mrad)"
     reading += f" at up to {motion.torque_max_Nm:.1f} Nm"
-    if two and abs(motion.other_moved_rad) > threshold_rad:
+    if other_moved:
         remedy = f"[{law}] is dead or its cable, object or node is wrong: [{other}] moved"
         return Finding("motion", PROBLEM, f"{reading}, that of [{other}] moved", remedy, numbers)
     remedy = "turn the joint by hand with the power off and watch the position: a reading that stands is the encoder; "
@@ -396,13 +408,33 @@ def _standing(
     return Finding("motion", PROBLEM, reading, remedy, numbers)
 
 
-def _encoders(motion: Motion, along: bool | None, law: str, other: str) -> Iterator[Finding]:
+def _swapped(
+    config: Config, law: str, other: str, ratio: float | None, tolerance: float = SAME_SCALE
+) -> Iterator[Finding]:
+    """One where `ratio`, of the other encoder over that of the law, is as with the counts of each in the other's key.
+
+    Each reading is wrong by the ratio of their counts then, one too long and one too short.
+    """
+    if config.joint_encoder is None or ratio is None:
+        return
+    own, second = config.encoder.counts_per_turn, config.joint_encoder.counts_per_turn
+    expected = (second / own) ** (2 if law == "joint_encoder" else -2)
+    if abs(expected - 1.0) <= SAME_SCALE or abs(abs(ratio) / expected - 1.0) > tolerance:
+        return
+    text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}], as if encoder.counts_per_turn (={own}) and "
+    text += f"joint_encoder.counts_per_turn (={second}) were swapped"
+    yield Finding("scale", PROBLEM, text, _SWAPPED_CURE, {"other_ratio": ratio})
+
+
+def _encoders(config: Config, motion: Motion, along: bool | None, law: str, other: str) -> Iterator[Finding]:
     """`along`: whether the joint moved with the torque by the encoder of the law; None where that is not known."""
     ratio = motion.other_ratio
     if ratio is None:
         return
     numbers = {"other_ratio": ratio}
-    if abs(ratio) < 0.02:
+    swapped = list(_swapped(config, law, other, ratio))
+    stood = abs(ratio) < STOOD and not swapped
+    if stood:
         yield Finding(
             "two encoders",
             PROBLEM,
@@ -417,11 +449,13 @@ def _encoders(motion: Motion, along: bool | None, law: str, other: str) -> Itera
         if along is None:
             remedy = f"{law}.direction or {other}.direction: turn the joint by hand with the power off"
         yield Finding("two encoders", PROBLEM, text, remedy, numbers)
-    if abs(ratio) >= 0.02 and abs(abs(ratio) - 1.0) > SAME_SCALE:
+    if swapped:
+        yield from swapped
+    elif not stood and abs(abs(ratio) - 1.0) > SAME_SCALE:
         text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}]"
         remedy = "counts_per_turn of one of them, encoder.side or joint.reduction_ratio, by that factor"
         yield Finding("scale", PROBLEM, text, remedy, numbers)
-    elif ratio > 0.0:
+    elif not stood and ratio > 0.0:
         yield Finding("two encoders", OK, f"the same direction, and {ratio:.3f} times the same way", "", numbers)
 
 
@@ -452,13 +486,13 @@ def _direction(motion: Motion, along: bool, law: str, other: str, numbers: dict[
     way = _way(motion)
     if not along:
         both = f"{law}.direction"
-        if motion.other_ratio is not None and motion.other_ratio > 0.02:
+        if motion.other_ratio is not None and motion.other_ratio > STOOD:
             both += f" and {other}.direction"
         remedy = (
             f"if the joint turned the way that you call positive at first: {both}; else drive.torque_direction; but "
             "first make sure that no load moved it, such as gravity that joint.gravity_Nm does not state"
         )
-        if motion.other_ratio is not None and motion.other_ratio < -0.02:
+        if motion.other_ratio is not None and motion.other_ratio < -STOOD:
             remedy = f"{law}.direction: [{other}] agrees with the torque"
         text = f"by [{law}] the joint moved against the torque, {way}: feedback would be positive"
         return Finding("direction", PROBLEM, text, remedy, numbers)

@@ -390,6 +390,55 @@ def test_counts_wrong_by_a_factor(tmp_path: Path, factor: float) -> None:
     assert_gentle(config, records)
 
 
+@pytest.mark.parametrize("start_rad", [0.0, 0.1])
+@pytest.mark.parametrize("law", ["encoder", "joint_encoder"])
+@pytest.mark.parametrize(("own", "second"), [(65536, 524288), (524288, 65536), (32768, 16384)])
+def test_counts_in_the_key_of_the_other_encoder(
+    tmp_path: Path, own: int, second: int, law: str, start_rad: float
+) -> None:
+    """`own` and `second` are those of the joint; away from zero the two disagree before it moves."""
+
+    def change(joint: Any) -> None:
+        joint._port[0].position_radpcount *= own / second
+        joint._port[0].second.radpcount *= second / own
+
+    encoder = {**NODE, "law": law}
+    true = config_with(
+        tmp_path, {**encoder, "counts_per_turn": second}, encoder__counts_per_turn=own,
+        virtual__initial_position_rad=start_rad,
+    )  # fmt: skip
+    swapped = config_with(tmp_path, {**encoder, "counts_per_turn": own}, encoder__counts_per_turn=second)
+    joint, plan = LockstepJoint(true), make_plan(swapped, None)
+    change(joint)
+    records, _, fault = check_in_lockstep(joint, swapped, plan)
+    found = list(motion_findings(swapped, plan, records, fault, None))
+    (scale,) = [finding for finding in found if finding.topic == "scale"]
+    assert scale.status == PROBLEM
+    assert scale.text.endswith(
+        f"as if encoder.counts_per_turn (={second}) and joint_encoder.counts_per_turn (={own}) were swapped"
+    )
+    assert scale.remedy.startswith("swap encoder.counts_per_turn and joint_encoder.counts_per_turn")
+    assert not any("dead" in finding.remedy or "stood still" in finding.text for finding in found)
+    assert (AxisPhase.APPROACH in records.phase) == (start_rad == 0.0)
+
+
+def test_an_encoder_that_stood_did_not_go_the_same_way(tmp_path: Path) -> None:
+    config = config_with(tmp_path, NODE, virtual__initial_position_rad=0.0)
+
+    def change(joint: Any) -> None:
+        joint._port[0].position_radpcount *= 0.01
+
+    found, _, _ = checked(config, change)
+    assert found["two encoders"].text == "[encoder] stood still while [joint_encoder] moved"
+
+
+def test_the_drives_counts_are_those_in_the_key_of_the_other_encoder(tmp_path: Path) -> None:
+    swapped = config_with(tmp_path, {**NODE, "counts_per_turn": 65536}, encoder__counts_per_turn=524288)
+    finding = judged(swapped, 65536.0)
+    assert (finding.status, "and so says joint_encoder.counts_per_turn" in finding.text) == (NOTE, True)
+    assert finding.remedy.startswith("swap encoder.counts_per_turn and joint_encoder.counts_per_turn")
+
+
 def test_a_joint_that_is_stuck(tmp_path: Path) -> None:
     friction = {"virtual__friction_positive_scale": 5.0, "virtual__friction_negative_scale": 5.0}
     config = config_with(tmp_path, **friction)
