@@ -44,7 +44,7 @@ SPELT_ALIKE = 0.7  # of difflib's ratio
 
 def shipped_config(name: str) -> Path:
     """Path of a configuration shipped with the package, with or without `.toml`; an arm's has a folder of its own."""
-    if (arm := SHIPPED_FOLDER / name / f"{name}.toml").is_file():
+    if os.path.isfile(arm := SHIPPED_FOLDER / name / f"{name}.toml"):  # no error of a name that is too long
         return arm
     return SHIPPED_FOLDER / (name if name.endswith(".toml") else f"{name}.toml")
 

@@ -217,7 +217,8 @@ def campaign_figure(verdicts: Sequence[Verdict], velocity_max_radps: float) -> A
         speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
         speed.set_xlim(-0.6, len(kinds) - 0.4)
         off.set_ylabel("off and at rest after the fault [s]")
-        off.set_yscale("log")
+        if any(math.isfinite(off_s) for some in points.values() for _, _, off_s in some):  # of none there is no scale
+            off.set_yscale("log")
         off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", rotation_mode="anchor", fontsize=8)
         speed.set_title("harmful faults blue, harmless twins green, violations red")
         return figure

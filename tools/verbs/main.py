@@ -170,7 +170,8 @@ def main() -> None:
         _refuse_usage(error)
         sys.exit(UsageError.exit_code)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        too_long = error.errno == errno.ENAMETOOLONG and error.filename is not None  # the name of a file to write
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) and not too_long:
             _end_unexpected(error)
         Output().error(f"{error.filename or 'a file or the output'}: cannot be written: {error.strerror}")
         if error.filename is None:

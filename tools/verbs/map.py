@@ -26,6 +26,7 @@ LEAST_TURNS = 4.0
 SPEED_SHARE = 0.5  # of limits.velocity_max_radps
 ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2
 _DWELL_S = 0.5
+_LONGEST_LEG_s = 3600.0
 _NEAR = 0.05  # share of the speed over which the slope of the friction is taken
 
 
@@ -61,8 +62,9 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
             f"{LEAST_TURNS:g} motor turns, and what the limits allow"
         )
     fastest = SPEED_SHARE * limits.velocity_max_radps
-    if not 0.0 < options.speed_radps <= fastest:
-        raise UsageError(f"--speed (={options.speed_radps:g}) must be above 0 and at most {fastest:g} rad/s")
+    slowest = travel_rad / _LONGEST_LEG_s
+    if not slowest <= options.speed_radps <= fastest:
+        raise UsageError(f"--speed (={options.speed_radps:g}) must be in [{slowest:.3g}..{fastest:g}] rad/s")
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
     acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
     leg_s = travel_rad / options.speed_radps + options.speed_radps / acceleration + _DWELL_S

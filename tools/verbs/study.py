@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def _workers(
-    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core", min=1)] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="processes; default: one a core", min=1, max=1024)
+    ] = None,
     cluster: Annotated[
         str | None,
         typer.Option("--cluster", metavar="TCP://HOST:PORT", help="on the workers of a dask scheduler (extra cluster)"),

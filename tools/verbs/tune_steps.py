@@ -91,7 +91,7 @@ from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
 from jointctl.tools.verbs.tune_report import values_of, write_report
-from jointctl.tools.written_file import replace_file
+from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
 STATE = "steps.json"
@@ -200,7 +200,7 @@ class Tune:
             self._refine()
 
     def _open(self, digest: str) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        prepare_folder(self.folder)
         path = self.folder / STATE
         about = {"configuration": digest, "torque_Nm": self.config.limits.torque_max_Nm}
         asked = [self.options.law, self.options.objective]

@@ -26,7 +26,7 @@ from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
 from jointctl.tools.verbs.verb_options import Verb, Verbs
-from tests.configurations import shipped
+from tests.configurations import shipped, written
 from tests.places import ROOT
 from tests.sessions import Terminal, output
 
@@ -105,6 +105,36 @@ def test_an_unexpected_error_is_one_line(
     stopped.seen = True  # a library has made this error of the KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt):
         main_module.main()
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["check", "{}.toml"], 3), (["stop", "{}.toml"], 3), (["new", "a.toml", "--from", "{}"], 3),
+        (["new", "{}.toml", "--no-input"], 8), (["params", "dump", "virtual", "-o", "{}.dcf"], 8),
+    ],
+)  # fmt: skip
+def test_a_name_that_is_too_long_is_no_fault_of_jointctl(tmp_path: Path, words: list[str], code: int) -> None:
+    done = ended(*(word.format("x" * 300) for word in words), cwd=tmp_path)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert (done.returncode, "fault of jointctl" in line) == (code, False)
+    assert "File name too long" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "part"),
+    [
+        (["map", "own.toml", "--lockstep", "-y", "--speed", "1e-320"], 2, "--speed (=9.99989e-321) must be in ["),
+        (["tune", "own.toml", "--lockstep", "--dry-run", "--folder", "file"], 8, "file: cannot be made: File exists"),
+        (["study", "--plants", "1", "--workers", "1025"], 2, "'--workers' (=1025)"),
+    ],
+)  # fmt: skip
+def test_odd_values_are_named(tmp_path: Path, words: list[str], code: int, part: str) -> None:
+    (tmp_path / "file").write_text("")
+    written(tmp_path / "own.toml", "precise")
+    done = ended(*words, cwd=tmp_path)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert (done.returncode, part in line) == (code, True), line
 
 
 def test_a_broken_pipe_in_a_verb_is_no_silent_end() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,10 @@ def test_the_points_of_a_campaign_follow_the_page_or_are_legible_on_it(count: in
     svg = svg_figure(campaign_figure(found, 1.0), "points").svg
     assert foreign_colours(svg) == set()
     assert ("data:image/png" in svg) is (count > MANY)
+
+
+def test_a_campaign_in_which_no_drive_was_switched_off_has_a_picture() -> None:
+    assert png(campaign_figure([replace(a_verdict(1), off_s=None)], 1.0))
 
 
 def test_the_heading_of_a_campaigns_table_keeps_its_units() -> None:
