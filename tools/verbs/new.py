@@ -80,7 +80,7 @@ def new(
     from jointctl.tools.configuration.load import read_text, shipped_config
     from jointctl.tools.inspection.first_files import filled
 
-    source = shipped_config(shipped or "elmo_gold_can")
+    source = shipped_config("elmo_gold_can" if shipped is None else shipped)
     text = read_text(source)
     if "[arm]" in text.splitlines():
         raise UsageError(

@@ -127,6 +127,7 @@ def test_a_name_that_is_too_long_is_no_fault_of_jointctl(tmp_path: Path, words: 
         (["map", "own.toml", "--lockstep", "-y", "--speed", "1e-320"], 2, "--speed (=9.99989e-321) must be in ["),
         (["tune", "own.toml", "--lockstep", "--dry-run", "--folder", "file"], 8, "file: cannot be made: File exists"),
         (["study", "--plants", "1", "--workers", "1025"], 2, "'--workers' (=1025)"),
+        (["new", "a.toml", "--from", "", "--no-input"], 3, ".toml: no such file"),  # a script's variable that is empty
     ],
 )  # fmt: skip
 def test_odd_values_are_named(tmp_path: Path, words: list[str], code: int, part: str) -> None:
