@@ -227,7 +227,8 @@ def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) ->
         enter(state, AxisPhase.FINISHED)
         return
     reads_off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
-    off = reads_off and state.sample_age_cycles == 0 and state.phase_cycle > ANSWER_CYCLES
+    answers = state.sample_age_cycles == 0 or sample.restarts != 0  # after its boot-up a drive sends no samples
+    off = reads_off and answers and state.phase_cycle > ANSWER_CYCLES
     if state.phase == AxisPhase.QUICK_STOPPING:
         if off:
             enter(state, AxisPhase.DISABLING)

@@ -356,6 +356,9 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
             port.heartbeat_heard_cycle = port.cycle
             if port.nmt_state == NmtState.BOOT_UP:
                 sample.restarts += 1
+                # a drive that has just booted has no power (CiA 402-2), and sends no TPDO that would say so
+                port.state = State.SWITCH_ON_DISABLED
+                sample.drive_state = drive_state(port.state)
     return False
 
 

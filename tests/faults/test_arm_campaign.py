@@ -146,6 +146,17 @@ def test_a_joint_that_friction_does_not_hold_sinks_by_little_when_its_torque_is_
     assert judge_arm(joints, masses, scenario).violations == ()
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_drive_that_reboots_leaves_the_others_their_ramps(arm: ArmConfig, joints: LockstepArm, axis: int) -> None:
+    """The heartbeat was withheld from all, as if a drive ignored its stop: they stopped by watchdog, and 5 s later."""
+    scenario = of_kind(arm, FaultKind.DRIVE_REBOOT, axis, harmless=False)
+    runs, _ = run_arm_scenario(joints, scenario)
+    assert [run.fault for run in runs] == [Fault.DRIVE_RESTARTED if k == axis else Fault.NONE for k in range(3)]
+    for run in runs:
+        assert run.state.phase == AxisPhase.FINISHED
+        assert run.log.time_ns[-1] - joints.start_ns < (scenario.fault.at_s + 1.0) * 1e9
+
+
 def test_what_is_the_computers_reaches_every_drive(arm: ArmConfig, joints: LockstepArm) -> None:
     """Off the bus: no drive gets a frame, so each stops by its own watchdog."""
     scenario = of_kind(arm, FaultKind.BUS_OFF, 0, harmless=False)

@@ -152,8 +152,7 @@ _CLASSES = (
     ),
     FaultClass(FaultKind.FOREIGN_FRAMES, None, Sizes(_ALWAYS, (1.0, 16.0)), on_wire=True),
     FaultClass(
-        FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS, (1.0, 1.0)), None,
-        frozenset({Fault.DRIVE_RESTARTED, Fault.OFF_TIMEOUT}), True,  # it says nothing more: off is not confirmed
+        FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS, (1.0, 1.0)), None, frozenset({Fault.DRIVE_RESTARTED}), True
     ),
     FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s), (1.0, 1.0)), None, frozenset({Fault.DRIVE_FAULT}), True),
     FaultClass(

@@ -321,6 +321,19 @@ def test_a_boot_up_is_a_restart_and_a_heartbeat_is_not(wire: Wire) -> None:
     assert wire.sample.restarts == 2
 
 
+def test_a_drive_that_has_booted_is_off_until_it_reports_otherwise(wire: Wire) -> None:
+    """Its last TPDO said "enabled": it was taken for a drive that ignores its stop, and the heartbeat was withheld."""
+    for reported, data in ((DriveState.ENABLED, None), (DriveState.OFF, b"\x00"), (DriveState.ENABLED, None)):
+        begin_cycle(wire.port, wire.frames)
+        if data is None:
+            wire.tpdo(STATUSWORDS[State.OPERATION_ENABLED])
+        else:
+            wire.receive(0x705, data)
+        assert wire.sample.drive_state == reported
+        wire.rpdo(0.0, DriveRequest.OFF)
+        assert wire.port.ignored_cycles == (0 if reported == DriveState.OFF else 1)
+
+
 def test_bus_load_counts_both_directions_at_worst_stuffing(wire: Wire) -> None:
     """SYNC 55, TPDO 135 and RPDO 95 bits are the 285 of the bus budget."""
     wire.port.cycle = 1

@@ -49,6 +49,20 @@ def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig
     assert twin.until(AxisPhase.TRACKING).state.fault == Fault.NONE
 
 
+@pytest.mark.parametrize("booted", [True, False])
+def test_a_drive_that_has_booted_is_off_although_it_sends_no_samples(rig: NewRig, booted: bool) -> None:
+    """The loop waited for OFF_TIMEOUT, 2 s.  The twin has said "off" too, but why its samples stay away is unknown."""
+    run = rig(0.05).until(AxisPhase.TRACKING).run(5)
+    run.sample.drive_state = DriveState.OFF
+    run.sample.restarts = int(booted)
+    cycles = 0
+    while run.phase != AxisPhase.FINISHED:
+        run.tick(fresh=False)
+        cycles += 1
+    assert (cycles <= 5) is booted
+    assert run.state.fault == (Fault.DRIVE_RESTARTED if booted else Fault.DRIVE_NOT_ENABLED)
+
+
 @pytest.mark.parametrize("phase", [AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING])
 def test_a_drive_that_brakes_by_itself_is_left_braking(rig: NewRig, phase: AxisPhase) -> None:
     """Power off would make it coast; at standstill, or after the time for a stop, it is switched off."""
