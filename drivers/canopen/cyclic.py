@@ -40,8 +40,10 @@ FRAME_SLOTS = 5
 SCRATCH_WORDS = 8
 SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND
-# A drive that was commanded to stop and still reports that it is enabled, or reports nothing, does not receive us (SYNC
+# A drive that was commanded to stop and does not report that it does so, or reports nothing, does not receive us (SYNC
 # or RPDO lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
+# The last report may be wrong, or older than the enabling that it has carried out: only one that says "off" counts, and
+# after a quick stop "braking" as well.
 IGNORED_MAX_CYCLES = 20
 # an error code stays for so long although the drive has reset it: it may be why the joint stops
 ERROR_SHOWN_CYCLES = 20
@@ -139,7 +141,8 @@ class CanopenPort:
     heartbeat_heard_cycle: i8
     error_cycle: i8  # in which the last EMCY came
     error_reset: i4  # the drive has said since that the error is gone
-    ignored_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
+    asked: i4  # 1: the drive was asked to enable, or to prepare for it
+    ignored_cycles: i4  # in a row in which the drive was asked to stop, and did not report that it does
     malformed: i8  # TPDOs that were too short
     error_frames: i8
     of_others: i8  # RPDOs to the drive that differ from the newest of ours: another controller's
@@ -421,6 +424,19 @@ def _put_velocity_offset(port: CanopenPort, frame: Frame, command: Command, enab
 
 
 @kernel
+def _ignores(port: CanopenPort, request: int) -> bool:
+    """Whether the drive's last report is not that of one that stops as it is asked to."""
+    state = port.state
+    if request == DriveRequest.ENABLE:
+        return False
+    if request == DriveRequest.PREPARE or port.asked == 0:
+        return state == State.OPERATION_ENABLED
+    if state == State.QUICK_STOP_ACTIVE:
+        return request == DriveRequest.OFF
+    return state != State.SWITCH_ON_DISABLED and state != State.FAULT and state != State.FAULT_REACTION_ACTIVE
+
+
+@kernel
 def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Command) -> None:
     """Write the RPDO (slot 2) and the one with the velocity offset.
 
@@ -441,7 +457,9 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
         frame.payload[i] = port.rpdo_filler[i]
     put_u16(frame.payload, port.control_at, control_word(port.state, request))  # type: ignore[arg-type]
     enabled = request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
-    if request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
+    if request == DriveRequest.ENABLE or request == DriveRequest.PREPARE:
+        port.asked = 1
+    if _ignores(port, request):  # type: ignore[arg-type]
         port.ignored_cycles += 1
     elif port.ignored_cycles <= IGNORED_MAX_CYCLES:
         port.ignored_cycles = 0

@@ -73,6 +73,27 @@ def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline
         assert run.state.phase == AxisPhase.FINISHED
 
 
+def powered_s(run: LockstepRun) -> float:
+    return (
+        float(
+            np.isin(run.truth[:, TRUE_POWER_STATE], (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)).sum()
+        )
+        * 1e-3
+    )
+
+
+@pytest.mark.parametrize("at_s", [0.0545, 0.055, 0.06])
+def test_a_drive_that_is_lost_in_the_moment_of_enabling_is_stopped_by_its_watchdog(
+    lockstep: LockstepJoint, at_s: float
+) -> None:
+    """It was enabled after its last report, which said "switched on": it kept its power, brake open, for 2.2 s."""
+    run = lockstep.run_with_faults(one_fault(FaultKind.SYNC_LOST, at_s), tail_s=1.0, epoch_at_start=True)
+    assert run.fault is Fault.STALE_SAMPLE
+    assert 0.0 < powered_s(run) <= SAMPLE_AGE_s + IGNORED_MAX_CYCLES * 1e-3 + HEARTBEAT_s + 0.01
+    twin = lockstep.run_with_faults(one_fault(FaultKind.SYNC_LOST, at_s, 0.045), epoch_at_start=True)
+    assert twin.fault is Fault.NONE
+
+
 def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(lockstep: LockstepJoint) -> None:
     run = lockstep.run_with_faults(one_fault(FaultKind.SYNC_LOST, AT_s, 0.045))
     assert run.fault is Fault.NONE

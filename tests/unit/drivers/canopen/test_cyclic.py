@@ -142,6 +142,32 @@ def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: i
     assert begin_cycle(enabled.port, enabled.frames) == frames
 
 
+OBEYS = {
+    DriveRequest.OFF: {State.SWITCH_ON_DISABLED, State.FAULT, State.FAULT_REACTION_ACTIVE},
+    DriveRequest.QUICK_STOP: {
+        State.SWITCH_ON_DISABLED, State.FAULT, State.FAULT_REACTION_ACTIVE, State.QUICK_STOP_ACTIVE
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("request_", OBEYS)
+@pytest.mark.parametrize("asked", [DriveRequest.ENABLE, DriveRequest.PREPARE, None])
+def test_only_a_report_of_stopping_shows_that_the_drive_stops(
+    wire: Wire, state: State, request_: DriveRequest, asked: DriveRequest | None
+) -> None:
+    """Its last report may be a damaged one, or of before it was enabled; one that was never asked need not obey."""
+    if asked is not None:
+        wire.rpdo(0.0, asked)
+    wire.tpdo(STATUSWORDS.get(state, 0x0001))
+    wire.rpdo(0.0, request_)
+    ignored = state is State.OPERATION_ENABLED if asked is None else state not in OBEYS[request_]
+    assert wire.port.ignored_cycles == ignored
+    wire.port.ignored_cycles = 0
+    wire.rpdo(0.0, DriveRequest.PREPARE)
+    assert wire.port.ignored_cycles == (state is State.OPERATION_ENABLED)
+
+
 @pytest.mark.parametrize(
     ("torque_Nm", "target"),
     [
