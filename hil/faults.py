@@ -8,6 +8,7 @@ Not modelled: error frames, the error counters of CAN.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Annotated, Any
 
@@ -24,8 +25,8 @@ from jointctl.hil.virtual_bus import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
 # --- Which fault, when, for how long, how much ---
 #
 # A fault is a record `FaultConstants`; the faults of a joint are an array of them, and `FaultMemory` is what they
-# share. Times count from `FaultMemory.epoch_ns`: the start of a run, or, while that is 0, the first time that the power
-# stage is on.  Chance comes from a xorshift64 generator in the memory, so that a run repeats bit by bit.
+# share.  Times count from `FaultMemory.epoch_ns`: the start of a run, or, while that is 0, the first time that the
+# power stage is on.  Chance comes from a xorshift64 generator in the memory, so that a run repeats bit by bit.
 
 MAX_FAULTS = 8
 LATE_FRAMES = 256  # that wait in the delay line; more are lost
@@ -68,12 +69,11 @@ class FaultKind(IntEnum):
     SUPERVISOR_SILENT = 31  # lockstep only
     PROGRAM_SILENT = 32  # that sends set-points; lockstep only
     PROGRAM_WILD = 33  # its set-points are that far off; lockstep only [rad, or NaN]
+    STOP_REQUESTED = 34  # no fault: the supervisor passes it on; lockstep only [StopRequest]
+    LOOP_KILLED = 35  # it does nothing more; lockstep only
 
 
-LOCKSTEP_ONLY = (
-    FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT, FaultKind.PROGRAM_SILENT,
-    FaultKind.PROGRAM_WILD,
-)  # fmt: skip
+LOCKSTEP_ONLY = tuple(kind for kind in FaultKind if kind >= FaultKind.LOOP_HELD_UP)
 
 
 @record
@@ -117,6 +117,16 @@ def no_faults() -> Any:
     return np.zeros(0, dtype_of(FaultConstants)).view(np.recarray)
 
 
+def fault_rows(of_axes: Sequence[np.ndarray], epoch_ns: int = 0) -> tuple[Any, Any]:
+    """The faults of each axis as FaultConstants[axes, M], filled up with none, and its FaultMemory[axes]."""
+    rows = np.zeros((len(of_axes), max(map(len, of_axes))), dtype_of(FaultConstants)).view(np.recarray)
+    memories = new(FaultMemory, len(of_axes))
+    for axis, faults in enumerate(of_axes):
+        rows[axis, : len(faults)] = faults
+        memories[axis] = fault_memory(faults, epoch_ns)[0]
+    return rows, memories
+
+
 @kernel
 def draw(memory: FaultMemory) -> float:
     """The next number in [0, 1)."""
@@ -144,7 +154,43 @@ def kind_active(faults: np.ndarray, memory: FaultMemory, kind: int, now_ns: int)
     return found
 
 
-# --- Controller and drive in lockstep, with the wire between them ---
+# --- Controller and drives in lockstep, with the wires between them; rows and memories have one element an axis ---
+
+
+@kernel
+def any_active(rows: np.ndarray, memories: np.ndarray, kind: int, now_ns: int) -> bool:
+    """Whether a fault of this kind is present at any axis."""
+    found = False
+    for axis in range(len(rows)):
+        found = found or kind_active(rows[axis], memories[axis], kind, now_ns)
+    return found
+
+
+@kernel
+def stop_requested(rows: np.ndarray, memories: np.ndarray, now_ns: int) -> int:
+    """The strongest `StopRequest` so far."""
+    request = 0
+    for axis in range(len(rows)):
+        for i in range(rows.shape[1]):
+            fault = rows[axis, i]
+            if fault.kind == FaultKind.STOP_REQUESTED and is_active(fault, memories[axis], now_ns):
+                request = max(request, int64(fault.magnitude))
+    return request
+
+
+@kernel
+def clock_step_cycles(rows: np.ndarray, memories: np.ndarray, now_ns: int, period_ns: int) -> int:
+    """By how many periods the controller's clock jumps in this cycle."""
+    cycles = 0
+    for axis in range(len(rows)):
+        epoch_ns = int64(memories[axis].epoch_ns)
+        for i in range(rows.shape[1]):
+            fault = rows[axis, i]
+            if fault.kind == FaultKind.CLOCK_STEP and epoch_ns != 0:
+                at_ns = epoch_ns + int64(fault.start_s * 1e9)
+                if at_ns <= now_ns < at_ns + period_ns:
+                    cycles += int64(fault.magnitude * 1e9) // period_ns
+    return cycles
 
 
 @kernel
@@ -187,18 +233,6 @@ def to_drive(
     """One frame of the controller goes through the wire."""
     pass_frame(faults, memory, frame, True, device.node_id, now_ns, memory.ready)
     hand_over(faults, memory, device, plant_c, plant_s, outgoing, now_ns)
-
-
-@kernel
-def clock_step_cycles(faults: np.ndarray, memory: FaultMemory, now_ns: int, period_ns: int) -> int:
-    """By how many periods the controller's clock jumps in this cycle."""
-    for i in range(len(faults)):
-        fault = faults[i]
-        if fault.kind == FaultKind.CLOCK_STEP and memory.epoch_ns != 0:
-            at_ns = memory.epoch_ns + int64(fault.start_s * 1e9)
-            if at_ns <= now_ns < at_ns + period_ns:
-                return int64(fault.magnitude * 1e9) // period_ns
-    return 0
 
 
 # --- What becomes of a frame between controller and drive while faults of the wire are present ---
@@ -254,7 +288,17 @@ def _unstamp(frame: np.ndarray) -> None:
 
 
 @kernel
-def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -> None:
+def _damage(memory: FaultMemory, frame: np.ndarray, corrupted: bool, length: int) -> None:
+    """Change what arrives: every byte drawn anew, another length (negative: its own)."""
+    if corrupted:
+        for i in range(int64(frame[4])):
+            frame[8 + i] = int64(draw(memory) * 256.0)
+    if length >= 0:
+        frame[4] = length
+
+
+@kernel
+def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int, corrupted: bool, length: int) -> None:
     slot = int64(memory.late_count)
     if slot >= LATE_FRAMES:
         return
@@ -263,6 +307,7 @@ def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -
     for i in range(FRAME_SIZE):
         memory.late_frames[slot, i] = frame[i]
     _unstamp(memory.late_frames[slot])
+    _damage(memory, memory.late_frames[slot], corrupted, length)
     memory.late_count = slot + 1
 
 
@@ -380,17 +425,14 @@ def pass_frame(
     if lost:
         return
     if late_ns > 0:
-        _keep(memory, frame, to_drive, now_ns + late_ns)
+        _keep(memory, frame, to_drive, now_ns + late_ns, corrupted, length)
         return
     if overtaken and not _one_waits(memory, to_drive):
-        _keep(memory, frame, to_drive, 0)
+        _keep(memory, frame, to_drive, 0, corrupted, length)
         return
     slot = append_frame(queue, frame)
-    if slot >= 0 and corrupted:
-        for i in range(int64(frame[4])):
-            queue.frames[slot, 8 + i] = int64(draw(memory) * 256.0)
-    if slot >= 0 and length >= 0:
-        queue.frames[slot, 4] = length
+    if slot >= 0:
+        _damage(memory, queue.frames[slot], corrupted, length)
     if twice and slot >= 0:
         slot = append_frame(queue, queue.frames[slot])
         if slot >= 0:

@@ -28,12 +28,14 @@ from jointctl.hil.canopen.device_core import accept_frame, advance, advance_toge
 from jointctl.hil.canopen.records import Device
 from jointctl.hil.faults import (
     FaultKind,
+    any_active,
     clock_step_cycles,
     collect,
     hand_over,
     is_active,
     kind_active,
     step_faults,
+    stop_requested,
     take_due,
     to_drive,
 )
@@ -77,7 +79,7 @@ ONE_BUS = np.zeros(64, np.int64)
 class World(NamedTuple):
     """The virtual drives, operational, with their joints and the wires to them; arrays of one record an axis.
 
-    Faults are those of one axis: its wire, drive and plant.  What is the computer's (clock, processor, supervisor) is
+    Faults are those of an axis: its wire, drive and plant.  What is the computer's (clock, processor, supervisor) is
     all axes' at once, an adapter that is off the bus that of all axes on its bus.
     """
 
@@ -85,10 +87,9 @@ class World(NamedTuple):
     plant_constants: np.ndarray
     plant: np.ndarray
     queue: np.ndarray  # FrameQueue
-    faults: np.ndarray  # FaultConstants[N]
+    faults: np.ndarray  # FaultConstants[axes, M]; M = 0: nothing of them is carried out
     fault_memory: np.ndarray
     arm: ArmPlant = no_arm_plant()  # through which the joints move one another
-    faulty: int = 0  # the axis that has the faults
     bus: np.ndarray = ONE_BUS  # int64[axes or more]: of each axis the first one on the same bus
 
 
@@ -148,8 +149,7 @@ def _perfect_measurement(state: AxisState, sample: Sample, plant: PlantState, pe
 def _is_off_bus(link: _Link, axis: int) -> bool:
     """Whether the adapter of this axis' bus is off it."""
     world = link.world
-    off = len(world.faults) > 0 and link.memory.timespec[_OFF_BUS] != 0
-    return off and world.bus[axis] == world.bus[world.faulty]
+    return world.faults.size > 0 and link.memory.timespec[_OFF_BUS] >> world.bus[axis] & 1 != 0
 
 
 @inlined
@@ -160,12 +160,14 @@ def _to_drive(link: _Link, axis: int, slot: int, sample: Sample) -> None:
         world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
     )  # fmt: skip
     frame = link.codec.frame_bytes[slot]
-    faulty, off_bus = len(world.faults) > 0, _is_off_bus(link, axis)
+    faulty, off_bus = world.faults.size > 0, _is_off_bus(link, axis)
     if faulty:
         sample.bus_errors = sample.bus_errors + 1 if off_bus else 0
-    if faulty and axis == world.faulty:
-        to_drive(world.faults, world.fault_memory[0], frame, device, joint_c, joint, outgoing, now_ns)
-    elif not (link.scenario.lost_to_drive or off_bus):
+    if link.scenario.lost_to_drive or off_bus:
+        return
+    if faulty:
+        to_drive(world.faults[axis], world.fault_memory[axis], frame, device, joint_c, joint, outgoing, now_ns)
+    else:
         accept_frame(device, joint_c, joint, frame, now_ns, outgoing)
 
 
@@ -184,17 +186,21 @@ def _empty_mailbox(mailbox: FrameQueue, codec: Codec, axis: int, samples: np.nda
 def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
     """SYNC to the drives, their answers into the samples; nothing is waited for."""
     world, codec = link.world, link.codec
-    if len(world.faults) > 0:  # what was late comes before SYNC, as in a real cycle
-        _empty_mailbox(world.fault_memory[0].to_controller, codec, world.faulty, samples, now_ns)
+    faulty = world.faults.size > 0
+    if faulty:  # what was late comes before SYNC, as in a real cycle
+        for axis in range(len(samples)):
+            if link.scenario.lost_from_drive or _is_off_bus(link, axis):
+                world.fault_memory[axis].to_controller.count = 0
+            _empty_mailbox(world.fault_memory[axis].to_controller, codec, axis, samples, now_ns)
     count = codec.begin(codec.link)
     for axis in range(len(samples)):
         for slot in range(count):
             _to_drive(link, axis, slot, samples[axis])
-        faulty = len(world.faults) > 0
         if link.scenario.lost_from_drive or _is_off_bus(link, axis):
             world.queue[axis].count = 0
-        if faulty and axis == world.faulty:
-            _empty_mailbox(world.fault_memory[0].to_controller, codec, axis, samples, now_ns + _ANSWER_NS)
+            world.fault_memory[axis].to_controller.count = 0
+        if faulty:
+            _empty_mailbox(world.fault_memory[axis].to_controller, codec, axis, samples, now_ns + _ANSWER_NS)
         else:
             _empty_mailbox(world.queue[axis], codec, axis, samples, now_ns + _ANSWER_NS)
         state, period_s = link.memory.state[axis], link.memory.constants[axis].law.period_s
@@ -233,7 +239,7 @@ def _put_set_points(
     stream: StreamConstants, world: World, points: np.ndarray, start_ns: int, put: int, now_ns: int
 ) -> int:
     """What the program does by `now_ns`, with its faults; how many of its set-points it has come to by then."""
-    faults, memory = world.faults, world.fault_memory[0]
+    faults, memory = world.faults[0], world.fault_memory[0]
     silent = kind_active(faults, memory, FaultKind.PROGRAM_SILENT, now_ns)
     while put < len(points) and start_ns + round(points[put, POINT_TIME_s] * 1e9) <= now_ns:
         if not silent:
@@ -253,22 +259,33 @@ def _put_set_points(
 @inlined
 def _step_world(world: World, now_ns: int) -> None:
     """Drives and joints up to now; what has come out of the wire by now is handed over."""
-    axis = world.faulty
-    device, joint_c, joint, outgoing = (
-        world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
-    )  # fmt: skip
-    faults, memory = world.faults, world.fault_memory[0]
-    if len(faults) > 0:
-        step_faults(faults, memory, device, joint_c, joint, now_ns)
+    faulty = world.faults.size > 0
+    if faulty:
+        for axis in range(len(world.device)):
+            device, joint_c, joint = world.device[axis], world.plant_constants[axis], world.plant[axis]
+            step_faults(world.faults[axis], world.fault_memory[axis], device, joint_c, joint, now_ns)
     if len(world.device) > 1 or len(world.arm.links) > 0:
         advance_together(world.device, world.plant_constants, world.plant, now_ns, world.queue, world.arm)
     else:
-        advance(device, joint_c, joint, now_ns, outgoing)
-    if len(faults) > 0:
-        collect(faults, memory, device, outgoing, now_ns)
-        take_due(memory, False, now_ns, False, memory.to_controller)
-        take_due(memory, True, now_ns, False, memory.ready)
-        hand_over(faults, memory, device, joint_c, joint, outgoing, now_ns)
+        advance(world.device[0], world.plant_constants[0], world.plant[0], now_ns, world.queue[0])
+    if faulty:
+        for axis in range(len(world.device)):
+            device, joint_c, joint = world.device[axis], world.plant_constants[axis], world.plant[axis]
+            faults, memory, outgoing = world.faults[axis], world.fault_memory[axis], world.queue[axis]
+            collect(faults, memory, device, outgoing, now_ns)
+            take_due(memory, False, now_ns, False, memory.to_controller)
+            take_due(memory, True, now_ns, False, memory.ready)
+            hand_over(faults, memory, device, joint_c, joint, outgoing, now_ns)
+
+
+@kernel
+def _buses_off(world: World, now_ns: int) -> int:
+    """One bit for each bus whose adapter is off it: that of its first axis."""
+    off = 0
+    for axis in range(len(world.faults)):
+        if kind_active(world.faults[axis], world.fault_memory[axis], FaultKind.BUS_OFF, now_ns):
+            off |= 1 << world.bus[axis]
+    return off
 
 
 @inlined
@@ -288,13 +305,14 @@ def part_of_a_run(
     """
     words, clock_memory, period_ns = memory.words, memory.timespec, scenario.period_ns
     start_ns, cycles = part[0], part[1]
-    faults, fault = world.faults, world.fault_memory[0]
-    faulty = len(faults) > 0
+    faults, fault_memory = world.faults, world.fault_memory
+    faulty = faults.size > 0
     link = _Link(codec, world, scenario, memory)
     exchange = Exchange(_receive, _send, link)
     clock = Clock(_clock_ns, _never_slept_ns)
-    if fault.epoch_ns < 0:
-        fault.epoch_ns = start_ns
+    for axis in range(len(fault_memory)):
+        if fault_memory[axis].epoch_ns < 0:
+            fault_memory[axis].epoch_ns = start_ns
     if scenario.supervisor_beats:
         store_release(words, Word.SUPERVISOR_NS, start_ns - period_ns)
     _clear(world)
@@ -316,8 +334,11 @@ def part_of_a_run(
             continue
         if cycle == scenario.stop_cycle:
             store_release(words, Word.STOP, scenario.stop_request)
-        if scenario.supervisor_beats and not kind_active(faults, fault, FaultKind.SUPERVISOR_SILENT, now_ns):
+        if scenario.supervisor_beats and not any_active(faults, fault_memory, FaultKind.SUPERVISOR_SILENT, now_ns):
             store_release(words, Word.SUPERVISOR_NS, now_ns)
+            if faulty:
+                request = stop_requested(faults, fault_memory, now_ns)
+                store_release(words, Word.STOP, max(load_acquire(words, Word.STOP), request))
         clock_memory[_NOW_NS] = now_ns
         if len(scenario.set_points) > 0:
             put = _put_set_points(memory.constants[0].stream, world, scenario.set_points, start_ns, put, now_ns)
@@ -327,12 +348,16 @@ def part_of_a_run(
                 reading.degC[0] = world.plant[axis].motor_temperature_degC
                 reading.time_ns[0] = now_ns
         if faulty:
-            if kind_active(faults, fault, FaultKind.LOOP_HELD_UP, now_ns):
+            if any_active(faults, fault_memory, FaultKind.LOOP_KILLED, now_ns):
+                finished_at = cycle
+                continue
+            missed += clock_step_cycles(faults, fault_memory, now_ns, period_ns)
+            if any_active(faults, fault_memory, FaultKind.LOOP_HELD_UP, now_ns):
                 missed += 1
                 continue
-            elapsed = 1 + missed + clock_step_cycles(faults, fault, now_ns, period_ns)
+            elapsed = 1 + missed
             missed = 0
-            clock_memory[_OFF_BUS] = 1 if kind_active(faults, fault, FaultKind.BUS_OFF, now_ns) else 0
+            clock_memory[_OFF_BUS] = _buses_off(world, now_ns)
         head = load_acquire(words, Word.HEAD)
         slot = Slot(period_ns, now_ns, now_ns, 0, elapsed, now_ns)
         if step_cycle(memory, exchange, clock, slot):

@@ -34,18 +34,15 @@ from jointctl.firmware_py.libc import (
     send,
     store_release,
 )
-from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.schema import new
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.bus_timing import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.faults import (
-    FaultConstants,
-    FaultMemory,
     append_frame,
-    fault_memory,
-    no_faults,
+    fault_rows,
     pass_frame,
     step_faults,
     take_due,
@@ -318,17 +315,6 @@ def store_release_word(words: np.ndarray, index: int, value: int) -> None:
     store_release(words, index, value)
 
 
-def _fault_rows(devices: Sequence[Cia402Device]) -> Any:
-    """FaultConstants[N, M] of the drives, those without filled up with none; None where no one has any."""
-    longest = max(len(device.faults) for device in devices)
-    if not longest:
-        return None
-    rows = np.zeros((len(devices), longest), dtype_of(FaultConstants)).view(np.recarray)
-    for row, device in zip(rows, devices, strict=True):
-        row[: len(device.faults)] = device.faults
-    return rows
-
-
 def _on_bus(frame: bytes, bus: int) -> bytes:
     return frame[:_BUS_BYTE] + bytes([bus]) + frame[_BUS_BYTE + 1 :]
 
@@ -348,10 +334,8 @@ class RealtimeDevice:
         fds = [fd] * len(self._devices) if isinstance(fd, int) else list(fd)
         self._fds, self._bus = np.array(fds), np.array([fds.index(one) for one in fds])
         self.words = np.zeros(WORDS, np.int64)
-        self._faults = _fault_rows(self._devices)
-        self.fault_memory = new(FaultMemory, len(self._devices))
-        for index, device in enumerate(self._devices):
-            self.fault_memory[index] = fault_memory(device.faults if len(device.faults) else no_faults())[0]
+        rows, self.fault_memory = fault_rows([device.faults for device in self._devices])
+        self._faults = rows if rows.size else None
         self._threads: list[threading.Thread] = []
         self._core_end: socket.socket | None = None
 

@@ -47,7 +47,7 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.arm_plant import no_arm_plant
 from jointctl.hil.canopen.device_core import advance_together
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults import FaultConstants, FaultKind, fault_memory, no_faults
+from jointctl.hil.faults import FaultKind, fault_rows, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, Scenario, run_lockstep
 from jointctl.hil.lockstep import World as Joint
 from jointctl.hil.virtual_bus import FrameQueue
@@ -63,6 +63,7 @@ from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.virtual_joint import arm_plant_of, new_devices
+from tests.made_faults import one_fault
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5
@@ -74,9 +75,8 @@ LOOK_s = 0.005
 SUPERVISOR, SESSION = "supervisor", "session"  # the second: a thread of the first, where that is a user's program
 SWITCHING_OFF = "switching off "  # threads of the first, one a drive of an arm
 _FRAME = struct.Struct("<IB3x8s")
-CUT_OFF, BUS_OFF = new(FaultConstants), new(FaultConstants)  # nothing gets to the drive, or drives, or comes from there
-CUT_OFF[0].kind, CUT_OFF[0].duration_s, CUT_OFF[0].magnitude = FaultKind.FRAMES_LOST, 1e9, 1.0
-BUS_OFF[0].kind, BUS_OFF[0].duration_s = FaultKind.BUS_OFF, 1e9
+# nothing gets to the drive, or drives, or comes from there
+CUT_OFF, BUS_OFF = one_fault(FaultKind.FRAMES_LOST, duration_s=1e9), one_fault(FaultKind.BUS_OFF, duration_s=1e9)
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
 
@@ -93,7 +93,7 @@ class World:
         arm = no_arm_plant() if isinstance(given, Config) else arm_plant_of(given)
         self.bus = first_on_bus(joints)  # of each axis
         self.buses = sorted(set(self.bus))
-        self.joints = Joint(*row, self.queues, no_faults(), fault_memory(no_faults()), arm, bus=np.array(self.bus))
+        self.joints = Joint(*row, self.queues, *fault_rows([no_faults()] * len(joints)), arm, bus=np.array(self.bus))
         self.now_ns = 1_000_000_000
         self.frames = 0
         self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
@@ -114,6 +114,14 @@ class World:
         self._let_joints_move()
         for device in self.devices:
             device.advance(self.now_ns)  # the boot-up message: no one is there yet
+
+    def lost_faults(self) -> tuple[Any, Any]:
+        """`cut_off` and `off_bus` as faults of the axes and their memories."""
+        rows = [no_faults() for _ in self.devices]
+        for axis, fault in ((self.cut_off, CUT_OFF), (self.off_bus, BUS_OFF)):
+            if axis is not None:
+                rows[axis] = np.concatenate([rows[axis], fault]).view(np.recarray)
+        return fault_rows(rows, -1)
 
     # --- time ---
 
@@ -368,10 +376,9 @@ class SimulatedLoop(LoopHandle):
         block, world, period_ns = self.block, self.world, self._period_ns
         axes = block.axes
         truth, joints = np.zeros((cycles, TRUTHS * axes)), world.joints
-        if world.cut_off is not None:
-            joints = joints._replace(faults=CUT_OFF, fault_memory=fault_memory(CUT_OFF, -1), faulty=world.cut_off)
-        if world.off_bus is not None:
-            joints = joints._replace(faults=BUS_OFF, fault_memory=fault_memory(BUS_OFF, -1), faulty=world.off_bus)
+        if world.cut_off is not None or world.off_bus is not None:
+            rows, memories = world.lost_faults()
+            joints = joints._replace(faults=rows, fault_memory=memories)
         scenario = Scenario(
             first_ns, period_ns, cycles, supervisor_beats=False,
             lost_to_drive=world.lost_to_drive, lost_from_drive=world.lost_from_drive,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.arm_plant import ArmPlant
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.faults import fault_memory, no_faults
+from jointctl.hil.faults import fault_rows, no_faults
 from jointctl.hil.lockstep import (
     NO_POINTS,
     TRUTHS,
@@ -234,7 +235,7 @@ class LockstepJoint:
         memory = _memory(constants, state, table[np.newaxis], new(LogRecord, records))
         world = World(
             self._virtual.device.copy(), self.plant_constants, self.plant_state.copy(), self._virtual.queue.copy(),
-            NO_FAULTS, fault_memory(NO_FAULTS, 0),
+            *fault_rows([NO_FAULTS]),
         )  # fmt: skip
         return SteppedRun(
             memory,
@@ -343,8 +344,7 @@ class LockstepJoint:
             self.plant_constants if plant_constants is None else plant_constants,
             plant,
             self._virtual.queue.copy(),
-            faults,
-            fault_memory(faults, epoch_ns),
+            *fault_rows([faults], epoch_ns),
         )
         memory = _memory(constants, state, (self.table if table is None else table)[np.newaxis], log)
         period_ns, thermometer = round(float(axis.law.period_s) * 1e9), self._settings.temperature is not None
@@ -422,8 +422,7 @@ class LockstepArm:
 
     def run_with_faults(
         self,
-        faults: np.ndarray,
-        faulty: int,
+        faults: Sequence[np.ndarray],
         constants: np.recarray,
         plants: tuple[Any, Any],
         plant: ArmPlant,
@@ -431,12 +430,13 @@ class LockstepArm:
         longest_s: float,
         tail_s: float,
     ) -> list[LockstepRun]:
-        """As `run`, with these `FaultConstants` on joint `faulty`; times count from the start of the run.
+        """As `run`, with these `FaultConstants` of each joint; times count from the start of the run.
 
         `plants`: constants and states, one a joint.  The joints are watched for `tail_s` after the controller has
         ended.
         """
-        world = self._world(plants, plant)._replace(faults=faults, fault_memory=fault_memory(faults, -1), faulty=faulty)
+        rows, memories = fault_rows(faults, -1)
+        world = self._world(plants, plant)._replace(faults=rows, fault_memory=memories)
         tail_cycles = int(tail_s / float(constants[0].law.period_s))
         cycles = LockstepJoint._longest_cycles(constants[0], longest_s)
         return self._carry_out(constants, self.arm.model.memory(), world, cycles=cycles, tail_cycles=tail_cycles)
@@ -444,8 +444,8 @@ class LockstepArm:
     def _world(self, plants: tuple[Any, Any], plant: ArmPlant) -> World:
         """The drives, and what they move, as they are when a run begins; constants and states of the joints."""
         return World(
-            self._devices.copy(), plants[0], plants[1].copy(), self._queues.copy(), NO_FAULTS,
-            fault_memory(NO_FAULTS, 0), ArmPlant(*(part.copy() for part in plant)),
+            self._devices.copy(), plants[0], plants[1].copy(), self._queues.copy(),
+            *fault_rows([NO_FAULTS] * len(self._devices)), ArmPlant(*(part.copy() for part in plant)),
             bus=np.array(first_on_bus(self.arm.joints)),
         )  # fmt: skip
 

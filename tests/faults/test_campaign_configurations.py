@@ -208,7 +208,7 @@ def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it
 )  # fmt: skip
 def test_a_slow_loop_or_filter_reacts_later(rate_Hz: float, cutoff_Hz: float, measuring_s: float) -> None:
     config = shipped(loop__rate_Hz=rate_Hz, control__velocity_cutoff_Hz=cutoff_Hz)
-    assert reaction_s(config, FaultKind.TORQUE_REVERSED) == pytest.approx(measuring_s, abs=1e-5)
+    assert reaction_s(config, [REVERSED]) == pytest.approx(measuring_s, abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from jointctl.tools.drawing import png
 from jointctl.tools.experiments import campaign as runner
 from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
-from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, draw_scenario, kinds_during
+from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, Event, draw_scenario, kinds_during
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
@@ -54,6 +54,34 @@ def test_no_scenario_violates_an_invariant(config: Config, lockstep: LockstepJoi
     tripped = [v for v in found if v.fault != "NONE"]
     assert len(tripped) > len(found) // 4  # the faults are no trifles
     assert all(v.fault == "NONE" for v in found if v.harmless)
+
+
+@pytest.mark.parametrize(("seed", "during"), [(14, "run"), (15, "program")])
+def test_no_pair_violates_an_invariant(config: Config, lockstep: LockstepJoint, seed: int, during: During) -> None:
+    drawn = [draw_scenario(seed, number, during, pairs=True) for number in range(3 * KINDS)]
+    found = [judge(config, lockstep, one) for one in drawn]
+    assert [(v.number, v.kind, v.then, v.violations) for v in found if v.violations] == []
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 3
+    events = [event for one in drawn for event in one.events]
+    assert {FaultKind.STOP_REQUESTED, FaultKind.LOOP_KILLED} <= {event.kind for event in events}
+    assert not any(v.harmless for v in found)
+
+
+def test_the_second_fault_of_a_pair_comes_as_often_in_the_cycle_as_in_the_stop() -> None:
+    drawn = [draw_scenario(1, number, pairs=True) for number in range(1000)]
+    after_s = [one.second.at_s - one.at_s for one in drawn if one.second is not None]
+    counts, _ = np.histogram(after_s, (0.0005, 0.005, 0.05, 0.5, 2.0))
+    assert counts == pytest.approx([278, 278, 278, 167], abs=50)
+    assert [draw_scenario(1, number).second for number in range(50)] == [None] * 50
+
+
+def test_a_damaged_report_is_not_that_of_a_drive_that_stops(config: Config, lockstep: LockstepJoint) -> None:
+    """The drive got no SYNC after it: it held its last torque for 5.1 s, until the heartbeat ended with the loop."""
+    verdict = judge(config, lockstep, draw_scenario(16, 1862, pairs=True))
+    assert (verdict.kind, verdict.then) == ("tpdo_corrupted", "sync_lost 1.6 ms later")
+    assert (verdict.fault, verdict.violations) == ("POSITION_JUMP", ())
+    assert verdict.off_s is not None
+    assert verdict.off_s < 0.25
 
 
 def test_every_kind_of_fault_has_its_class() -> None:
@@ -86,9 +114,7 @@ def good_run(cycles: int = 300, tail: int = 100) -> LockstepRun:
 
 def all_checks(run: LockstepRun, fault_row: int = -1) -> list[str]:
     scenario = draw_scenario(1, 0)
-    ending, _ = judge_module._ending(run, WIDE, fault_row, 1e-3)
-    again = judge_module._enabled_again(run, scenario, 0, 1_000_000)
-    return judge_module._commands(run, WIDE) + judge_module._motion(run, WIDE) + ending + again
+    return judge_module.wrong_of_joint(run, WIDE, scenario.events, fault_row, 0, 1_000_000)[0]
 
 
 def test_a_good_run_violates_nothing() -> None:
@@ -146,38 +172,49 @@ def test_only_a_corrupted_frame_may_enable_after_the_loop_has_given_up(
     run.truth[rises : rises + 2, TRUE_POWER_STATE] = PowerState.OPERATION_ENABLED
     run.truth[rises + 2 :, TRUE_POWER_STATE] = PowerState.SWITCH_ON_DISABLED
     scenario = dataclasses.replace(draw_scenario(1, 0), kind=kind, duration_s=0.003)
-    assert (judge_module._enabled_again(run, scenario, 0, 1_000_000) == []) is allowed
+    assert (judge_module._enabled_again(run, scenario.events, 0, 1_000_000) == []) is allowed
 
 
 @pytest.mark.parametrize(("off_row", "late"), [(1299, False), (1302, True)])
 def test_the_time_to_stop_is_checked_at_its_boundary(off_row: int, late: bool) -> None:
     run = good_run(300, 1200)
     run.truth[253:off_row, TRUE_POWER_STATE] = PowerState.QUICK_STOP_ACTIVE
-    lines = judge_module._ending(run, WIDE, 300, 1e-3)[0]
+    lines = judge_module._time_off(run, WIDE, (), 300, 1e-3)[0]
     assert any("after the fault" in line for line in lines) is late
+
+
+@pytest.mark.parametrize(("off_row", "late"), [(1219, False), (1222, True)])
+def test_a_loop_that_is_killed_is_given_up_in_time(off_row: int, late: bool) -> None:
+    run = good_run(300, 1200)
+    run.state.phase = AxisPhase.TRACKING
+    run.truth[200:off_row, TRUE_POWER_STATE] = PowerState.QUICK_STOP_ACTIVE
+    killed = Event(FaultKind.LOOP_KILLED, True, 0.22, 30.0, 1.0)
+    lines, _ = judge_module.wrong_of_joint(run, WIDE, [killed], -1, 0, 1_000_000)
+    assert [line for line in lines if "after the death of the loop" in line] == lines
+    assert bool(lines) is late
+    assert "the axis did not finish, phase TRACKING" in judge_module.wrong_of_joint(run, WIDE, [], -1, 0, 1_000_000)[0]
 
 
 def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Config, lockstep: LockstepJoint) -> None:
     number = list(FAULT_CLASSES).index(FaultKind.DRIVE_REBOOT)
     scenario = dataclasses.replace(draw_scenario(1, number), at_s=1.5, trajectory=draw_scenario(1, 1).trajectory)
     run, _ = run_scenario(config, lockstep, scenario)
-    assert judge_module.wrong_cause(run, scenario, 1e-3, lockstep.start_ns) == []
+    assert judge_module.wrong_cause(run, scenario.events, 1e-3, lockstep.start_ns) == []
     wrong = dataclasses.replace(run, fault=Fault.VELOCITY_LIMIT)
-    (line,) = judge_module.wrong_cause(wrong, scenario, 1e-3, lockstep.start_ns)
+    (line,) = judge_module.wrong_cause(wrong, scenario.events, 1e-3, lockstep.start_ns)
     assert "the cause is reported as VELOCITY_LIMIT" in line
     left = dataclasses.replace(run, fault=Fault.DRIVE_NOT_ENABLED)
     for code, told in ((0x8250, False), (0x8130, True)):
         left.state.fault_drive_error = code
-        lines = judge_module.wrong_cause(
-            left, dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST), 1e-3, lockstep.start_ns
-        )
+        lost = dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST)
+        lines = judge_module.wrong_cause(left, lost.events, 1e-3, lockstep.start_ns)
         assert any("reported as 8130h, not 8250h" in line for line in lines) is told
-    harmless = dataclasses.replace(scenario, harmless=True)
-    assert "a harmless fault tripped" in judge_module.wrong_cause(run, harmless, 1e-3, lockstep.start_ns)[0]
+    (line,) = judge_module.wrong_cause(run, scenario.events, 1e-3, lockstep.start_ns, twin=True)
+    assert "a harmless fault tripped" in line
     early = dataclasses.replace(scenario, at_s=1e6)
     quiet, _ = run_scenario(config, lockstep, early)
     late = dataclasses.replace(scenario, at_s=1.2)
-    assert judge_module.wrong_cause(quiet, late, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
+    assert judge_module.wrong_cause(quiet, late.events, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
 
 
 REVERSED = dataclasses.replace(  # on a plant of 2 kg m2 without ripple, whose friction is the configured one
@@ -198,7 +235,9 @@ def test_the_envelope_follows_its_derivation(config: Config, lockstep: LockstepJ
     assert allowed.position_max_rad == pytest.approx(0.7 + way)
     assert allowed.position_min_rad == pytest.approx(-0.7 - way)
     assert allowed.stop_s == pytest.approx(0.01 + speed / brake + 1.0)
-    assert reaction_s(config, FaultKind.SYNC_LOST) == pytest.approx(0.01 + 0.05 + 0.02 + 0.2)
+    assert reaction_s(config, [dataclasses.replace(REVERSED, kind=FaultKind.SYNC_LOST)]) == pytest.approx(
+        0.01 + 0.05 + 0.02 + 0.2
+    )
 
 
 # --- the verb ---
@@ -232,10 +271,28 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
         == 10
     )
     assert page.read_text().count("made up") == 2
-    assert "--seed 5 --scenario 0" in err.getvalue()
+    assert "virtual.toml --seed 5 --scenario 0" in err.getvalue()
     report = json.loads((tmp_path / "campaign.json").read_text())
     assert report["violations"][1]["violations"] == ["made up"]
     assert report["violations"][1]["scenario"]["number"] == 1
+
+
+def test_a_violation_of_a_pair_names_both_and_is_replayed(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
+    shown, _, err = output(json=True)
+    drawn = Drawn(count=1, seed=5, pairs=True)
+    assert fault_campaign(config, shown, drawn=drawn, folder=tmp_path, workers=Workers(1)) == 10
+    first = draw_scenario(5, 0, pairs=True)
+    assert first.second is not None
+    assert f"scenario 0 (frames_lost, {first.then(first.second)}): made up" in err.getvalue()
+    assert "virtual.toml --pairs --seed 5 --scenario 0" in err.getvalue()
+    shown, out, _ = output(json=True)
+    assert fault_campaign(config, shown, drawn=dataclasses.replace(drawn, scenario=0)) == 10
+    told = json.loads(out.getvalue())
+    assert told["scenario"]["second"]["kind"] == first.second.kind.name.lower()
+    assert told["verdict"]["then"] == first.then(first.second)
 
 
 def test_one_scenario_is_replayed(config: Config) -> None:

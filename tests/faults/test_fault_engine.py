@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import (
     MAX_FAULTS,
     FaultConstants,
@@ -19,7 +20,7 @@ from jointctl.hil.faults import (
     pass_frame,
     take_due,
 )
-from jointctl.hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.tools.lockstep import LockstepJoint
 from tests.made_faults import faults_of, one_fault
@@ -124,6 +125,18 @@ def test_doubled_reordered_corrupted_and_of_another_length(kind: str, frame: tup
     assert shorter[4] == 3
 
 
+def test_a_frame_that_is_late_or_overtaken_is_damaged_as_well() -> None:
+    """It came whole: a fault beside another one was less than alone."""
+    for kind, magnitude in ((FaultKind.TPDO_DELAYED, 0.5), (FaultKind.TPDO_REORDERED, 1.0)):
+        for damage in (FaultKind.TPDO_LENGTH, FaultKind.TPDO_CORRUPTED):
+            wire = Wire(faults_of((kind, 0.0, 1.0, magnitude), (damage, 0.0, 1.0, 3.0)))
+            came = wire.send(TPDO, False) + wire.send(TPDO, False) + wire.due(False, 900.0)
+            assert len(came) == 2
+            shortened = damage is FaultKind.TPDO_LENGTH
+            assert [data[4] for data in came] == [3 if shortened else TPDO[1]] * 2
+            assert all((len(set(data[8:16])) > 1) is not shortened for data in came)
+
+
 def test_foreign_frames_come_before_the_drives_own_and_never_look_like_it() -> None:
     wire = Wire(one_fault(FaultKind.FOREIGN_FRAMES, magnitude=9.0))
     for _ in range(200):
@@ -179,6 +192,24 @@ def test_the_motor_yields_no_more_than_it_can(
     actuator = np.abs(run.truth[:, TRUE_ACTUATOR_Nm])
     assert actuator[1500:2000].max() > 12.0
     assert actuator[2100:].max() < most_Nm
+
+
+def test_a_clock_that_leaps_while_the_loop_is_held_up_is_late_by_both(lockstep: LockstepJoint) -> None:
+    held, both = (
+        lockstep.run_with_faults(faults_of((FaultKind.LOOP_HELD_UP, 2.0, 0.02, 1.0), *more), longest_s=4.0)
+        for more in ((), ((FaultKind.CLOCK_STEP, 2.01, 0.01, 0.02),))
+    )
+    assert both.log.skipped.max() == held.log.skipped.max() + 20
+
+
+@pytest.mark.parametrize("request_", StopRequest)
+def test_a_stop_that_is_requested_and_a_loop_that_is_killed(lockstep: LockstepJoint, request_: StopRequest) -> None:
+    stop = (FaultKind.STOP_REQUESTED, 2.0, 30.0, float(request_) + 0.5)
+    run = lockstep.run_with_faults(faults_of(stop, (FaultKind.LOOP_KILLED, 2.005, 30.0, 1.0)), tail_s=1.0)
+    expected = (AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)[request_]
+    assert run.log.phase[-1] in (expected, AxisPhase.FINISHED)
+    assert run.log.phase[-8] == AxisPhase.TRACKING
+    assert run.truth[-1, TRUE_POWER_STATE] not in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
 
 def test_faults_end_and_leave_no_trace(lockstep: LockstepJoint) -> None:

@@ -1,7 +1,8 @@
 """The campaign on an arm: one joint has the fault, all joints move, and what must then hold for each and for all.
 
 Scenario `number` of a seed has the fault that a single joint's scenario of that number has (`fault_scenarios`), on one
-joint after the other; torques are scaled to that joint's limit.  Every joint has a motion and a plant of its own.
+joint after the other; torques are scaled to that joint's limit.  Every joint has a motion and a plant of its own.  The
+second fault of a pair is any joint's.
 
 What holds for a single joint (`judge`) must hold for each of them.  Besides:
 
@@ -42,10 +43,10 @@ from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.experiments.fault_scenarios import (
-    FAULT_CLASSES,
     LATE_CAUSES,
     MOTION,
     REACH_RAD,
+    Event,
     Scenario,
     draw_plant,
     draw_scenario,
@@ -65,7 +66,9 @@ from jointctl.tools.experiments.judge import (
     TAIL_s,
     Verdict,
     beyond_rad,
+    causes_of,
     fault_row_of,
+    magnitude_of,
     reaction_s,
     require_joint_fits,
     wrong_cause,
@@ -82,16 +85,19 @@ RIPPLE_SHARE = 0.4  # of what is drawn for that joint, at the same torque
 PAPER_BRISTLE_Nmprad = 8e4
 INERTIA_SCALES = (0.95, 1.05)
 OF_TORQUE = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.LOAD_JUMP})  # magnitudes in Nm
-# of the computer, so of all joints at once; of an adapter, of all on its bus
+# of the computer, so of all joints at once; BUS_OFF is an adapter's, so of all on its bus
 COMMON = frozenset(
-    {FaultKind.BUS_OFF, FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT}
+    {
+        FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT, FaultKind.STOP_REQUESTED,
+        FaultKind.LOOP_KILLED,
+    }
 )  # fmt: skip
 WEAK = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.CURRENT_LOOP_DEAD})  # the motor yields too little
 
 
 @dataclass(frozen=True)
 class ArmScenario:
-    """What happens to each joint; the fault is in the scenario of joint `faulty`, those of the others have none."""
+    """What happens to each joint; the first fault is in the scenario of joint `faulty`, a second one in any."""
 
     faulty: int
     joints: tuple[Scenario, ...]
@@ -101,12 +107,26 @@ class ArmScenario:
     def fault(self) -> Scenario:
         return self.joints[self.faulty]
 
-    def touched(self, joints: Sequence[Config]) -> list[int]:
-        """Those that have the fault at once."""
+    @property
+    def second(self) -> tuple[int, Event] | None:
+        """Of a pair: the joint, and what it has."""
+        return next(((k, one.second) for k, one in enumerate(self.joints) if one.second is not None), None)
+
+    @property
+    def twin(self) -> bool:
+        return self.fault.harmless and self.second is None
+
+    def touching(self, joints: Sequence[Config]) -> list[list[Event]]:
+        """Of each joint, the events that it has at once."""
         buses = first_on_bus(joints)
-        if self.fault.kind is FaultKind.BUS_OFF:
-            return [axis for axis, bus in enumerate(buses) if bus == buses[self.faulty]]
-        return list(range(len(joints))) if self.fault.kind in COMMON else [self.faulty]
+        touching: list[list[Event]] = [[] for _ in joints]
+        for axis, joint in enumerate(self.joints):
+            for event in joint.events:
+                for other, events in enumerate(touching):
+                    of_bus = event.kind is FaultKind.BUS_OFF and buses[other] == buses[axis]
+                    if other == axis or event.kind in COMMON or of_bus:
+                        events.append(event)
+        return touching
 
     def describe(self) -> dict[str, Any]:
         """For JSON and people."""
@@ -114,15 +134,17 @@ class ArmScenario:
             {"inertia_scale": scale, **{k: v for k, v in joint.describe().items() if k in ("trajectory", "plant")}}
             for scale, joint in zip(self.inertia_scales, self.joints, strict=True)
         ]
-        fault = {k: v for k, v in self.fault.describe().items() if k not in ("trajectory", "plant")}
-        return {**fault, "joint": self.faulty, "joints": joints}
+        fault = {k: v for k, v in self.fault.describe().items() if k not in ("trajectory", "plant", "second")}
+        then = {} if self.second is None else {"second": {**self.second[1].describe(), "joint": self.second[0]}}
+        return {**fault, "joint": self.faulty, **then, "joints": joints}
 
 
-def draw_arm_scenario(arm: ArmConfig, seed: int, number: int) -> ArmScenario:
+def draw_arm_scenario(arm: ArmConfig, seed: int, number: int, *, pairs: bool = False) -> ArmScenario:
     """Scenario `number` of the campaign with this seed."""
-    base = draw_scenario(seed, number)
-    faulty = number // len(kinds_during("run")) % len(arm.joints)
+    base = draw_scenario(seed, number, pairs=pairs)
+    faulty = number // len(kinds_during("run", pairs=pairs)) % len(arm.joints)
     random = np.random.default_rng([seed, number, 1])
+    has_second = int(np.random.default_rng([seed, number, 3]).integers(len(arm.joints)))
     joints, scales = [], []
     for axis, config in enumerate(arm.joints):
         limits, size = config.limits, config.limits.torque_max_Nm / SIZED_FOR_Nm
@@ -133,12 +155,14 @@ def draw_arm_scenario(arm: ArmConfig, seed: int, number: int) -> ArmScenario:
         joint = replace(base, trajectory=trajectory, plant=_plant(random, config, size),
                         start_offset_rad=float(random.uniform(-0.1, 0.1)))  # fmt: skip
         scales.append(float(random.uniform(*INERTIA_SCALES)))
-        if axis != faulty:
-            joint = replace(joint, kind=FaultKind.NONE)
-        elif joint.kind in OF_TORQUE:
-            joint = replace(joint, magnitude=size * joint.magnitude)
-        joints.append(fitted(config, joint))
+        joint = _sized(joint, size) if axis == faulty else replace(joint, kind=FaultKind.NONE)
+        second = _sized(base.second, size) if base.second is not None and axis == has_second else None
+        joints.append(fitted(config, replace(joint, second=second)))
     return ArmScenario(faulty, tuple(joints), tuple(scales))
+
+
+def _sized(event: Any, size: float) -> Any:
+    return replace(event, magnitude=size * event.magnitude) if event.kind in OF_TORQUE else event
 
 
 def _plant(random: np.random.Generator, config: Config, size: float) -> dict[str, Any]:
@@ -184,7 +208,7 @@ def run_arm_scenario(joints: LockstepArm, scenario: ArmScenario) -> tuple[list[L
     parts = [plant_of(*one) for one in zip(arm.joints, scenario.joints, starts, strict=True)]
     plants = tuple(np.concatenate([part[i] for part in parts]).view(np.recarray) for i in (0, 1))
     runs = joints.run_with_faults(
-        scenario.fault.fault(), scenario.faulty, constants, (plants[0], plants[1]), arm_plant_of(arm),
+        [joint.faults() for joint in scenario.joints], constants, (plants[0], plants[1]), arm_plant_of(arm),
         longest_s=APPROACH_s + scenario.fault.trajectory.duration_s + SPARE_s, tail_s=TAIL_s,
     )  # fmt: skip
     return runs, constants
@@ -212,34 +236,30 @@ def masses_of(arm: ArmConfig) -> Masses:
     return Masses(np.abs(np.linalg.inv(inertias)).max(axis=0) / low, throw, np.abs(gravity).max(axis=0) * high)
 
 
-def envelopes(joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: np.recarray) -> list[Envelope]:
-    """Of each joint, see the module."""
-    arm, fault = joints.arm, scenario.fault
-    pushes = masses.gravity_Nm + [sum(joint.plant["torque_ripple_Nm"]) for joint in scenario.joints]
+def envelopes(
+    joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: np.recarray, reached_radps: Any = np.inf
+) -> list[Envelope]:
+    """Of each joint, see the module; `reached_radps`: the greatest speed of each in the run."""
+    arm, touching = joints.arm, scenario.touching(joints.arm.joints)
+    loads = masses.gravity_Nm + [magnitude_of(joint.events, FaultKind.LOAD_JUMP) for joint in scenario.joints]
+    pushes = loads + [sum(joint.plant["torque_ripple_Nm"]) for joint in scenario.joints]
     pushes += [_drive_Nm(config) for config in arm.joints]
-    if fault.kind is FaultKind.LOAD_JUMP:
-        pushes[scenario.faulty] += abs(fault.magnitude)
     push = masses.inverse @ pushes
     speed_limits = np.array([config.limits.velocity_max_radps for config in arm.joints])
-    touched = scenario.touched(arm.joints)
-    waits = np.array([
-        reaction_s(config, fault.kind if axis in touched else FaultKind.NONE)
-        for axis, config in enumerate(arm.joints)
-    ])  # fmt: skip
+    waits = np.array([reaction_s(config, events) for config, events in zip(arm.joints, touching, strict=True)])
     brakes = np.minimum([config.sequence.brake_radps2 for config in arm.joints], joints.quick_stop_radps2)
     alone = speed_limits + push * waits
     fall_s = np.zeros(len(alone))
-    if fault.kind in WEAK:
-        fall_s[scenario.faulty] = (alone / brakes)[scenario.faulty] + BRAKE_SPARE_s
-    elif fault.kind is FaultKind.LOAD_JUMP:
-        fall_s[scenario.faulty] = fault.duration_s
-    loads = masses.gravity_Nm.copy()
-    if fault.kind is FaultKind.LOAD_JUMP:
-        loads[scenario.faulty] += abs(fault.magnitude)
+    for axis, joint in enumerate(scenario.joints):
+        for event in joint.events:
+            if event.kind in WEAK:
+                fall_s[axis] += (alone / brakes)[axis] + BRAKE_SPARE_s
+            elif event.kind is FaultKind.LOAD_JUMP:
+                fall_s[axis] += event.duration_s
     alone = alone + masses.inverse @ loads * fall_s
     speeds = alone + masses.throw @ alone
     ways = speed_limits * waits + 0.5 * push * waits**2 + speeds * fall_s + speeds**2 / (2.0 * brakes)
-    stops = waits + fall_s + speeds / brakes + BRAKE_SPARE_s
+    stops = waits + fall_s + np.minimum(speeds, reached_radps) / brakes + BRAKE_SPARE_s
     found = []
     for axis, config in enumerate(arm.joints):
         shift, speed = _misread(config, scenario, constants[axis], axis, float(ways[axis]))
@@ -259,23 +279,23 @@ def _misread(
     config: Config, scenario: ArmScenario, constants: np.recarray, axis: int, way: float
 ) -> tuple[float, float]:
     """What a wrong reading adds to the joint that has it: (rad, rad/s)."""
-    fault = scenario.fault
-    if axis != scenario.faulty:
-        return 0.0, 0.0
-    if fault.kind is FaultKind.ENCODER_JUMP:
-        return abs(fault.magnitude), 0.0
-    if fault.kind is FaultKind.ENCODER_DRIFT:
-        run_s = APPROACH_s + fault.trajectory.duration_s + config.sequence.stop_timeout_s
-        return abs(fault.magnitude) * min(fault.duration_s, run_s + 1.0), abs(fault.magnitude)
-    if fault.kind is FaultKind.ENCODER_REVERSED:
-        return 2.0 * config.limits.following_error_max_rad + way, 0.0
-    if fault.kind is FaultKind.ENCODER_STUCK:  # blind, pushed by what a healthy joint does not stand still under
-        friction = constants.law.friction
-        viscous = min(friction.positive.viscous_Nmspr, friction.negative.viscous_Nmspr)
-        blind = float(constants.limits.frozen_torque_Nm / (viscous * config.joint.reduction_ratio))
-        pushed = _drive_Nm(config) / config.joint.inertia_kgm2 * constants.limits.frozen_cycles / config.loop.rate_Hz
-        return BLIND_RAD * (blind + pushed) / BLIND_RADPS, blind + pushed
-    return 0.0, 0.0
+    joint = scenario.joints[axis]
+    wrong, faster = magnitude_of(joint.events, FaultKind.ENCODER_JUMP), 0.0
+    for event in joint.events:
+        if event.kind is FaultKind.ENCODER_DRIFT:
+            run_s = APPROACH_s + joint.trajectory.duration_s + config.sequence.stop_timeout_s
+            wrong += abs(event.magnitude) * min(event.duration_s, run_s + 1.0)
+            faster += abs(event.magnitude)
+        elif event.kind is FaultKind.ENCODER_REVERSED:
+            wrong += 2.0 * config.limits.following_error_max_rad + way
+        elif event.kind is FaultKind.ENCODER_STUCK:  # blind, pushed by what a healthy joint does not stand still under
+            friction, limits = constants.law.friction, constants.limits
+            viscous = min(friction.positive.viscous_Nmspr, friction.negative.viscous_Nmspr)
+            blind = float(limits.frozen_torque_Nm / (viscous * config.joint.reduction_ratio))
+            blind += _drive_Nm(config) / config.joint.inertia_kgm2 * limits.frozen_cycles / config.loop.rate_Hz
+            wrong += BLIND_RAD * blind / BLIND_RADPS
+            faster += blind
+    return wrong, faster
 
 
 def _envelope(config: Config, constants: np.recarray, way: float, speed: float, stop_s: float) -> Envelope:
@@ -308,13 +328,14 @@ def judge_arm(joints: LockstepArm, masses: Masses, scenario: ArmScenario) -> Ver
     """
     runs, constants = run_arm_scenario(joints, scenario)
     period_ns, start_ns = round(float(constants[0].law.period_s) * 1e9), int(joints.start_ns)
-    allowed = envelopes(joints, masses, scenario, constants)
+    peaks = np.array([np.abs(run.truth[:, TRUE_VELOCITY_radps]).max() for run in runs])
+    allowed = envelopes(joints, masses, scenario, constants, peaks)
     fault_rows = [fault_row_of(run, start_ns, period_ns) for run in runs]
     first = min((row for row in fault_rows if row >= 0), default=-1)
     found, off_s = [], []
-    names = joints.arm.names
-    for axis, name in enumerate(names):
-        wrong, off = wrong_of_joint(runs[axis], allowed[axis], scenario.joints[axis], first, start_ns, period_ns)
+    touching, second = scenario.touching(joints.arm.joints), scenario.second
+    for axis, name in enumerate(joints.arm.names):
+        wrong, off = wrong_of_joint(runs[axis], allowed[axis], touching[axis], first, start_ns, period_ns)
         found += [f"{name}: {line}" for line in wrong]
         off_s.append(off)
     found += _torque_before_all(runs, start_ns, period_ns) + _not_together(runs)
@@ -325,14 +346,15 @@ def judge_arm(joints: LockstepArm, masses: Masses, scenario: ArmScenario) -> Ver
     return Verdict(
         number=fault.number,
         kind=fault.kind.name.lower(),
-        harmless=fault.harmless,
+        harmless=scenario.twin,
+        then="" if second is None else f"{fault.then(second[1])}, {joints.arm.names[second[0]]}",
         fault=named.fault.name,
         reaction=Reaction(int(named.state.reaction)).name,
         violations=tuple(found),
-        peak_radps=max(float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max()) for run in runs),
+        peak_radps=float(peaks.max()),
         beyond_rad=beyond[worst],
         allowed_rad=allowed[worst].position_max_rad - float(constants[worst].limits.position_max_rad),
-        off_s=None if first < 0 else max(value for value in off_s if value is not None),
+        off_s=max((value for value in off_s if value is not None), default=None),
     )
 
 
@@ -364,20 +386,25 @@ def _wrong_report(
     period_ns: int,
 ) -> list[str]:  # fmt: skip
     """The joint and the cause that are reported first, and what others report after it."""
-    fault, faulty, names = scenario.fault, scenario.faulty, arm.names
-    touched = scenario.touched(arm.joints)
+    faulty, names, touching = scenario.faulty, arm.names, scenario.touching(arm.joints)
     first = min((row for row in fault_rows if row >= 0), default=-1)
     earliest = [axis for axis, row in enumerate(fault_rows) if row == first]
+    shaking = any(Fault.LIMIT_CYCLE in causes_of(events) for events in touching)
     if first < 0 or faulty in earliest:
         reported = faulty
-    elif common := [axis for axis in earliest if axis in touched]:
+    elif common := [axis for axis in earliest if touching[axis]]:
         reported = common[0]
-    elif Fault.LIMIT_CYCLE in FAULT_CLASSES[fault.kind].causes and runs[earliest[0]].fault is Fault.LIMIT_CYCLE:
+    elif shaking and runs[earliest[0]].fault is Fault.LIMIT_CYCLE:
         reported = earliest[0]  # a joint that swings shakes the others, and a lighter one shows it first
     else:
         return [f"the fault is reported as that of {names[earliest[0]]}, {runs[earliest[0]].fault.name}"]
-    found = [f"{names[reported]}: {line}" for line in wrong_cause(runs[reported], fault, period_ns * 1e-9, start_ns)]
-    if fault.harmless:
+    everything = [event for joint in scenario.joints for event in joint.events]
+    at_once = touching[reported] if first >= 0 else everything
+    # where the drive of a joint does not receive us, the heartbeat is withheld from all
+    withheld = LATE_CAUSES & causes_of(everything) if scenario.second is not None else frozenset()
+    wrong = wrong_cause(runs[reported], at_once, period_ns * 1e-9, start_ns, twin=scenario.twin, also=withheld)
+    found = [f"{names[reported]}: {line}" for line in wrong]
+    if scenario.twin:
         return found or [f"{names[axis]}: a harmless fault of {names[faulty]} tripped {run.fault.name}"
                          for axis, run in enumerate(runs) if run.fault is not Fault.NONE]  # fmt: skip
     return found + [
@@ -385,5 +412,5 @@ def _wrong_report(
         for axis, run in enumerate(runs)
         if axis != reported
         and run.fault is not Fault.NONE
-        and run.fault not in MOTION | LATE_CAUSES | (FAULT_CLASSES[fault.kind].causes if axis in touched else set())
+        and run.fault not in MOTION | LATE_CAUSES | causes_of(touching[axis])
     ]

@@ -44,15 +44,18 @@ class Scenarios:
     config: Config | ArmConfig
     seed: int
     during: During
+    pairs: bool
     numbers: tuple[int, ...]
     place: PlaceStep | None = None  # during a tune
 
 
-def scenario_of(config: Config | ArmConfig, seed: int, number: int, during: During) -> Scenario | ArmScenario:
+def scenario_of(
+    config: Config | ArmConfig, seed: int, number: int, during: During, *, pairs: bool = False
+) -> Scenario | ArmScenario:
     """Scenario `number` of the campaign with this seed."""
     if isinstance(config, ArmConfig):
-        return draw_arm_scenario(config, seed, number)
-    return draw_scenario(seed, number, during)
+        return draw_arm_scenario(config, seed, number, pairs=pairs)
+    return draw_scenario(seed, number, during, pairs=pairs)
 
 
 def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
@@ -76,7 +79,7 @@ def judge_all(some: Scenarios) -> list[Verdict]:
     if getattr(_kept, "key", None) != key:
         _kept.judge = judge_of(config, during, some.place)
         _kept.key = key
-    return [_kept.judge(scenario_of(config, some.seed, number, during)) for number in some.numbers]
+    return [_kept.judge(scenario_of(config, some.seed, number, during, pairs=some.pairs)) for number in some.numbers]
 
 
 def run_campaign(
@@ -87,13 +90,15 @@ def run_campaign(
     workers: Workers = HERE,
     during: During = "run",
     place: PlaceStep | None = None,
+    *,
+    pairs: bool = False,
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
     parts = (range(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
-    tasks = (Scenarios(config, seed, during, tuple(numbers), place) for numbers in parts)
+    tasks = (Scenarios(config, seed, during, pairs, tuple(numbers), place) for numbers in parts)
     try:
         with closing(workers.results(judge_all, tasks)) as results:
             for verdicts in results:
@@ -166,11 +171,11 @@ def table(rows: Sequence[KindRow]) -> Table:
 
 
 def violations(
-    config: Config | ArmConfig, verdicts: Sequence[Verdict], seed: int, during: During = "run"
+    config: Config | ArmConfig, verdicts: Sequence[Verdict], seed: int, during: During = "run", *, pairs: bool = False
 ) -> list[dict[str, Any]]:
     """Everything that is needed to look at each violation again."""
     return [
-        {**asdict(verdict), "scenario": scenario_of(config, seed, verdict.number, during).describe()}
+        {**asdict(verdict), "scenario": scenario_of(config, seed, verdict.number, during, pairs=pairs).describe()}
         for verdict in verdicts
         if verdict.violations
     ]

@@ -1,10 +1,14 @@
-"""Random scenarios: a plant, a motion, one fault or its harmless twin.  Number and seed decide everything.
+"""Random scenarios: a plant, a motion, one fault or its harmless twin, or two.  Number and seed decide everything.
 
 `FAULT_CLASSES` says what each kind of fault may do: its sizes, harmful and harmless, and the causes that the loop may
 then name.  A harmless size is just inside what the limits of `configs/virtual.toml` allow: it must not stop the joint.
 Five kinds have none: a drive that restarts or is in fault is off, a corrupted frame may say anything, and a single
 sample counted the wrong way is a leap at any speed worth a trajectory.  Causes are those of the fault itself;
 `LATE_CAUSES` may follow any fault that begins when the joint is already being stopped.
+
+Of a pair the second fault begins 0.5 ms to 2 s after the first, as often in each tenfold of that time: within a cycle,
+in the reaction, in the stop, after it.  A stop by the user and the death of the loop are events of pairs as well.  What
+is harmless alone may not be so beside another one: no pair is a twin, and either one's causes may be named.
 
 The motion is a trajectory of `jointctl run`, or a few plateaus of constant speed as of `jointctl sweep`, in the mode in
 which a sweep runs: the drive closes the velocity loop where it can (CSV, else PV), else the law that a sweep uses.
@@ -202,7 +206,11 @@ _OF_A_PROGRAM = (
     ),
     FaultClass(FaultKind.PROGRAM_WILD, None, Sizes((0.002, 1.0), (0.05, 100.0))),  # nothing of it is followed
 )  # fmt: skip
-FAULT_CLASSES = {item.kind: item for item in (*_CLASSES, *_OF_A_PROGRAM)}
+_OF_A_PAIR = (
+    FaultClass(FaultKind.STOP_REQUESTED, None, Sizes((LONG_s, LONG_s), (1.0, 3.99))),
+    FaultClass(FaultKind.LOOP_KILLED, None, Sizes((LONG_s, LONG_s), (1.0, 1.0)), on_wire=True),  # reported by no one
+)
+FAULT_CLASSES = {item.kind: item for item in (*_CLASSES, *_OF_A_PROGRAM, *_OF_A_PAIR)}
 EMERGENCY_CODES = (0x2311, 0x3120, 0x3310, 0x4310, 0x5441, 0x7121, 0x7300, 0x8480, 0x8611)
 SIGNED = frozenset({FaultKind.ENCODER_JUMP, FaultKind.ENCODER_DRIFT, FaultKind.LOAD_JUMP, FaultKind.PROGRAM_WILD})
 
@@ -324,29 +332,58 @@ REACH_RAD = 0.4  # of the trajectories; the limits are at 0.7
 TOP_SPEED_RADPS = 0.6  # of the trajectories; the limit is 1
 FILTER_OF_SWAPS = (100.0, 0.001)  # cutoff [Hz] and period [s] with which every reordering of a twin is harmless
 BEFORE_s = 1.8  # until the trajectory begins, at most
+SECOND_AFTER_s = (0.0005, 2.0)
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """What happens; `plant` holds the settings that differ from the configuration's."""
+class Event:
+    """A fault, or its harmless twin."""
 
-    number: int
-    seed: int
     kind: FaultKind
     harmless: bool
     at_s: float  # after the start of the run
     duration_s: float
     magnitude: float
+
+    def describe(self) -> dict[str, Any]:
+        return {**asdict(self), "kind": self.kind.name.lower()}
+
+    def then(self, second: Event | None) -> str:
+        """`drive_reboot 1.5 ms later`, empty without a second one."""
+        if second is None:
+            return ""
+        twin = "harmless " if second.harmless else ""
+        return f"{twin}{second.kind.name.lower()} {1e3 * (second.at_s - self.at_s):.1f} ms later"
+
+
+@dataclass(frozen=True)
+class Scenario(Event):
+    """What happens: this event, and maybe a second one; `plant` holds what differs from the configuration's."""
+
+    number: int
+    seed: int
     trajectory: Any
     start_offset_rad: float  # of the joint from the first point of the trajectory
     plant: dict[str, Any]
+    second: Event | None = None
 
-    def fault(self) -> Any:
-        """`FaultConstants`, a record array of one."""
-        faults = new(FaultConstants)
-        record = faults[0]
-        record.kind, record.start_s, record.duration_s = self.kind, self.at_s, self.duration_s
-        record.magnitude, record.seed = self.magnitude, self.number + 1
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What goes wrong with this joint, in the order of time."""
+        first = () if self.kind is FaultKind.NONE else (self,)
+        return first if self.second is None else (*first, self.second)
+
+    @property
+    def twin(self) -> bool:
+        """Whether it must not stop the joint."""
+        return self.harmless and self.second is None
+
+    def faults(self) -> Any:
+        """`FaultConstants`, a record array of the events."""
+        faults = new(FaultConstants, len(self.events))
+        for record, event in zip(faults, self.events, strict=True):
+            record.kind, record.start_s, record.duration_s = event.kind, event.at_s, event.duration_s
+            record.magnitude, record.seed = event.magnitude, self.number + 1
         return faults
 
     def describe(self) -> dict[str, Any]:
@@ -355,8 +392,8 @@ class Scenario:
             trajectory, every = trajectory.trajectory, {"set_point_every_s": trajectory.every_s}
         strokes = isinstance(trajectory, SweepStrokes | TuneStep)
         return {
-            **{k: v for k, v in asdict(self).items() if k != "trajectory"},
-            "kind": self.kind.name.lower(),
+            **{k: v for k, v in super().describe().items() if k not in ("trajectory", "second")},
+            **({} if self.second is None else {"second": self.second.describe()}),
             "trajectory": asdict(trajectory) if strokes else {**trajectory.model_dump(exclude_none=True), **every},
             "plant": {k: (v.name.lower() if isinstance(v, FrictionKind) else v) for k, v in self.plant.items()},
         }
@@ -416,16 +453,14 @@ def _size(random: np.random.Generator, sizes: Sizes) -> tuple[float, float]:
     return float(duration), float(random.uniform(*sizes.magnitude))
 
 
-def kinds_during(during: During) -> list[FaultKind]:
+def kinds_during(during: During, *, pairs: bool = False) -> list[FaultKind]:
     """The kinds of fault of a campaign, in their order."""
-    return [item.kind for item in (*_CLASSES, *(_OF_A_PROGRAM if during == "program" else ()))]
+    more = (*(_OF_A_PROGRAM if during == "program" else ()), *(_OF_A_PAIR if pairs else ()))
+    return [item.kind for item in (*_CLASSES, *more)]
 
 
-def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
-    """Scenario `number` of the campaign with this seed."""
-    random = np.random.default_rng([seed, number])
-    kinds = kinds_during(during)
-    chosen = FAULT_CLASSES[kinds[number % len(kinds)]]  # in turn: every kind gets its share
+def _draw_sizes(random: np.random.Generator, chosen: FaultClass) -> tuple[bool, float, float]:
+    """(harmless, duration [s], magnitude)."""
     harmless = chosen.harmful is None or (chosen.harmless is not None and random.random() < HARMLESS_SHARE)
     sizes = chosen.harmless if harmless else chosen.harmful
     assert sizes is not None
@@ -434,6 +469,23 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
         magnitude = -magnitude
     if chosen.kind is FaultKind.DRIVE_FAULT:
         magnitude = float(random.choice(EMERGENCY_CODES))
+    return harmless, duration, magnitude
+
+
+def _draw_second(seed: int, number: int, kinds: list[FaultKind], first_s: float) -> Event:
+    random = np.random.default_rng([seed, number, 2])
+    chosen = FAULT_CLASSES[kinds[int(random.integers(len(kinds)))]]
+    harmless, duration, magnitude = _draw_sizes(random, chosen)
+    at_s = first_s + math.exp(random.uniform(*np.log(SECOND_AFTER_s)))
+    return Event(chosen.kind, harmless, at_s, duration, magnitude)
+
+
+def draw_scenario(seed: int, number: int, during: During = "run", *, pairs: bool = False) -> Scenario:
+    """Scenario `number` of the campaign with this seed."""
+    random = np.random.default_rng([seed, number])
+    kinds = kinds_during(during, pairs=pairs)
+    chosen = FAULT_CLASSES[kinds[number % len(kinds)]]  # in turn: every kind gets its share
+    harmless, duration, magnitude = _draw_sizes(random, chosen)
     tracking_s = float(random.uniform(0.5, 2.5))
     step = draw_step(random) if during == "tune" else None
     latest_s = BEFORE_s + (LONGEST_s if during == "sweep" or step is not None else tracking_s)
@@ -442,13 +494,11 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
     if during == "program":
         trajectory = Program(trajectory, float(random.uniform(0.002, 0.02)))
     return Scenario(
-        number, seed, chosen.kind, harmless,
-        at_s=at_s,
-        duration_s=duration,
-        magnitude=magnitude,
+        chosen.kind, harmless, at_s, duration, magnitude, number, seed,
         trajectory=trajectory,
         start_offset_rad=float(random.uniform(-0.1, 0.1)),
         plant=draw_plant(random),
+        second=_draw_second(seed, number, kinds, at_s) if pairs else None,
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ quick stop with what the load leaves of it:
     d = (F - ripple - L) / J,   x2 = v1^2 / (2 d)
 
 or by the drive's quick stop along 6085 where that is slower still: such a ramp holds the joint up against its friction.
+The time until it is off and at rest is that of the speed that it did reach.
 
 `t` is `REACTION_s` where the loop measures and the drive receives, or more where these take longer: one period each for
 sample and command, the velocity filter (three time constants, 5 ms at 100 Hz) and the motor's delay and lag.  Where the
@@ -25,13 +26,16 @@ A reading that is wrong by w (jump, drift) shifts the true position by w.  Behin
 until POSITION_FROZEN: it is pushed with at most frozen_torque_Nm for longer than PUSHED_CYCLES, 16 Nm more than the
 Coulomb friction, which the viscous part (18 Nm s/rad below the knee) balances at 0.9 rad/s; the pushed cycles with
 full torque add (60 - 13) Nm / J x 20 ms = 0.5 rad/s.  `BLIND_RADPS` is that and a quarter.
-Not covered: more than one fault at a time, a drive that applies torque by itself, a load greater than the friction
+Of two faults each may come in the worst moment of the other: what `t`, loads and wrong readings add up to counts.  A
+loop that is killed is given up by the drive after drive.heartbeat_s.
+Not covered: more than two faults at a time, a drive that applies torque by itself, a load greater than the friction
 for good (it needs a brake).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -61,6 +65,7 @@ from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     LATE_CAUSES,
     BEFORE_s,
+    Event,
     LONGEST_s,
     PlacedSweep,
     PlaceStep,
@@ -115,15 +120,18 @@ def _measuring_s(config: Config) -> float:
     return max(REACTION_s, 2.0 / config.loop.rate_Hz + filter_s + MOTOR_s)
 
 
-def reaction_s(config: Config, kind: FaultKind) -> float:
+def reaction_s(config: Config, events: Sequence[Event]) -> float:
     """Longest time from passing a limit to the beginning of the reaction."""
-    age_s, measuring_s = config.limits.sample_age_max_s, _measuring_s(config)
-    if kind in _UNHEARD:
-        ignored_s = IGNORED_MAX_CYCLES / config.loop.rate_Hz
-        return measuring_s + age_s + ignored_s + canopen_section(config).heartbeat_s
-    if kind in _BLIND_FOR_A_WHILE:
-        return measuring_s + age_s
-    return measuring_s
+    age_s, ignored_s = config.limits.sample_age_max_s, IGNORED_MAX_CYCLES / config.loop.rate_Hz
+    waits_s = {kind: age_s + ignored_s + canopen_section(config).heartbeat_s for kind in _UNHEARD}
+    waits_s |= dict.fromkeys(_BLIND_FOR_A_WHILE, age_s)
+    waits_s[FaultKind.LOOP_KILLED] = canopen_section(config).heartbeat_s
+    return _measuring_s(config) + sum(waits_s.get(event.kind, 0.0) for event in events)
+
+
+def magnitude_of(events: Sequence[Event], kind: FaultKind) -> float:
+    """The sum of those of that kind, whatever their signs."""
+    return sum(abs(event.magnitude) for event in events if event.kind is kind)
 
 
 def load_Nm(config: Config) -> float:
@@ -147,40 +155,44 @@ def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
 
 
 def envelope(
-    config: Config, scenario: Scenario, constants: AxisConstants, quick_stop_radps2: float = math.inf
-) -> Envelope:
-    """See the module; `constants` is the AxisConstants record of the scenario, the quick stop that of the drive."""
-    limits, kind = constants.limits, scenario.kind
+    config: Config, scenario: Scenario, constants: AxisConstants, quick_stop_radps2: float = math.inf,
+    reached_radps: float = math.inf,
+) -> Envelope:  # fmt: skip
+    """See the module; `constants` is the AxisConstants record of the scenario, the quick stop that of the drive.
+
+    `reached_radps` is the greatest speed of the run: from more it was not braked.
+    """
+    limits, events = constants.limits, scenario.events
     inertia = scenario.plant["inertia_kgm2"]
     ripple = sum(scenario.plant["torque_ripple_Nm"])
-    load = abs(scenario.magnitude) if kind is FaultKind.LOAD_JUMP else 0.0
+    load = magnitude_of(events, FaultKind.LOAD_JUMP)
     share = 1e-3 * (canopen_section(config).max_torque_permille or 1000)
     drive_Nm = share * (canopen_section(config).rated_torque_Nm or 0.0) * config.joint.reduction_ratio
     constant_Nm = load_Nm(config)
     floor = _friction_floor_Nm(config, scenario) - ripple - constant_Nm
-    wait_s = reaction_s(config, kind)
+    wait_s = reaction_s(config, events)
     push = (drive_Nm + ripple + load + constant_Nm) / inertia
     speed = limits.velocity_max_radps + push * wait_s
     brake = min((min(floor, drive_Nm + floor - load) if load else floor) / inertia, quick_stop_radps2)
     way = limits.velocity_max_radps * wait_s + 0.5 * push * wait_s**2 + speed**2 / (2.0 * brake)
-    stop_s = wait_s + speed / brake + BRAKE_SPARE_s
+    stop_s = wait_s + min(speed, reached_radps) / brake + BRAKE_SPARE_s
     if load > floor:  # after power off it moves the joint for the rest of its time
-        pushed = (load - floor) / inertia * scenario.duration_s
-        way += 0.5 * pushed * scenario.duration_s + pushed**2 / (2.0 * brake)
+        loaded_s = sum(event.duration_s for event in events if event.kind is FaultKind.LOAD_JUMP)
+        pushed = (load - floor) / inertia * loaded_s
+        way += 0.5 * pushed * loaded_s + pushed**2 / (2.0 * brake)
         speed = max(speed, pushed)
-        stop_s += scenario.duration_s + pushed / brake
-    shift = 0.0
-    if kind is FaultKind.ENCODER_JUMP:
-        shift = abs(scenario.magnitude)
-    elif kind is FaultKind.ENCODER_DRIFT:
-        run_s = constants.sequence.approach_s + constants.trajectory.duration_s + config.sequence.stop_timeout_s
-        shift = abs(scenario.magnitude) * min(scenario.duration_s, run_s + 1.0)
-        speed += abs(scenario.magnitude)
-    elif kind is FaultKind.ENCODER_STUCK:
-        shift, speed = BLIND_RAD, max(speed, BLIND_RADPS)
-        stop_s += speed / brake
-    elif kind is FaultKind.ENCODER_REVERSED:
-        shift = 2.0 * limits.following_error_max_rad + way
+        stop_s += loaded_s + min(pushed, reached_radps) / brake
+    shift = magnitude_of(events, FaultKind.ENCODER_JUMP)
+    for event in events:
+        if event.kind is FaultKind.ENCODER_DRIFT:
+            run_s = constants.sequence.approach_s + constants.trajectory.duration_s + config.sequence.stop_timeout_s
+            shift += abs(event.magnitude) * min(event.duration_s, run_s + 1.0)
+            speed += abs(event.magnitude)
+        elif event.kind is FaultKind.ENCODER_STUCK:
+            shift, speed = shift + BLIND_RAD, max(speed, BLIND_RADPS)
+            stop_s += min(speed, reached_radps) / brake
+        elif event.kind is FaultKind.ENCODER_REVERSED:
+            shift += 2.0 * limits.following_error_max_rad + way
     return Envelope(
         position_min_rad=limits.position_min_rad - way - shift,
         position_max_rad=limits.position_max_rad + way + shift,
@@ -260,7 +272,7 @@ SPARE_s = 14.0  # for waiting, enabling and stopping
 NEVER_s = 1e6
 TAIL_s = 2.5  # watched after the controller has ended
 AFTER_s = 0.1  # after its last set-point, a program stops the joint
-NOTICED_s = 0.35  # a certain fault that begins so long before the end of the trajectory must be noticed
+NOTICED_s = 0.35  # a certain fault that begins so long before the last torque must be noticed, or its least duration
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 
 
@@ -273,6 +285,7 @@ class Verdict:
     harmless: bool
     fault: str
     reaction: str
+    then: str  # the second event of a pair
     violations: tuple[str, ...]
     peak_radps: float
     beyond_rad: float  # how far the joint got beyond its position limits
@@ -324,7 +337,10 @@ def in_time(config: Config, joint: LockstepJoint, scenario: Scenario, place: Pla
     placed = _placed(config, joint, scenario, place)
     if placed is None:
         return scenario
-    return replace(scenario, at_s=scenario.at_s * (BEFORE_s + placed.duration_s) / (BEFORE_s + LONGEST_s))
+    at_s = scenario.at_s * (BEFORE_s + placed.duration_s) / (BEFORE_s + LONGEST_s)
+    if (second := scenario.second) is not None:
+        second = replace(second, at_s=second.at_s - scenario.at_s + at_s)
+    return replace(scenario, at_s=at_s, second=second)
 
 
 def _carry_out(
@@ -337,7 +353,7 @@ def _carry_out(
 ) -> tuple[LockstepRun, Any]:
     """`duration_s`: of the motion, or, with set-points, until the program stops the joint."""
     run = joint.run_with_faults(
-        scenario.fault(), constants,
+        scenario.faults(), constants,
         plant_constants=plant[0], plant_state=plant[1], epoch_at_start=True, set_points=set_points,
         stop_cycle=round(duration_s / float(constants[0].law.period_s)) if len(set_points) else NO_STOP,
         longest_s=float(constants[0].sequence.approach_s) + duration_s + SPARE_s, tail_s=TAIL_s,
@@ -394,19 +410,34 @@ def _off_row(run: LockstepRun) -> int:
     return int(rows[-1]) + 1 if len(rows) else 0
 
 
-def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float) -> tuple[list[str], float | None]:
-    found = []
-    if run.state.phase != AxisPhase.FINISHED:
-        found.append(f"the axis did not finish, phase {AxisPhase(int(run.state.phase)).name}")
+def _time_off(
+    run: LockstepRun, allowed: Envelope, events: Sequence[Event], fault_row: int, period_s: float
+) -> tuple[list[str], float | None]:
+    """From the latched fault, or the death of the loop, until the power is off and the joint stands."""
     off_row = _off_row(run)
-    if off_row >= len(run.truth):
+    longest = allowed.ramp_s if (run.log.phase == AxisPhase.RAMPING).any() else allowed.stop_s
+    what, begin = "fault", fault_row
+    killed_s = min((event.at_s for event in events if event.kind is FaultKind.LOOP_KILLED), default=math.inf)
+    if off_row * period_s > killed_s and run.state.phase != AxisPhase.FINISHED:  # what it would have done, it cannot
+        what, begin, longest = "death of the loop", math.ceil(killed_s / period_s), allowed.stop_s
+    if begin < 0:
+        return [], None
+    off_s = max(off_row - begin, 0) * period_s
+    # a load that comes later moves the joint, whether it has power or not
+    loaded_s = max((event.at_s for event in events if event.kind is FaultKind.LOAD_JUMP), default=0.0)
+    longest += max(loaded_s - begin * period_s, 0.0)
+    if off_s > longest:
+        return [f"off and at rest {off_s:.3f} s after the {what}, allowed {longest:.3f}"], off_s
+    return [], off_s
+
+
+def _ending(run: LockstepRun, events: Sequence[Event]) -> list[str]:
+    found = []
+    killed = any(event.kind is FaultKind.LOOP_KILLED for event in events)
+    if run.state.phase != AxisPhase.FINISHED and not killed:
+        found.append(f"the axis did not finish, phase {AxisPhase(int(run.state.phase)).name}")
+    if _off_row(run) >= len(run.truth):
         found.append("the joint is not off and at rest in the end")
-    off_s = None
-    if fault_row >= 0:
-        off_s = max(off_row - fault_row, 0) * period_s
-        longest = allowed.ramp_s if (run.log.phase == AxisPhase.RAMPING).any() else allowed.stop_s
-        if off_s > longest:
-            found.append(f"off and at rest {off_s:.3f} s after the fault, allowed {longest:.3f}")
     requests = np.asarray(run.log.request)
     asked = np.flatnonzero(requests == DriveRequest.ENABLE)
     # before it moves, an arm waits at PREPARE again for a joint that has fallen back
@@ -415,10 +446,10 @@ def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float
     )
     if len(asked) and not asking[asked[0] : asked[-1]].all():
         found.append("the loop asked to enable again after it had asked to stop")
-    return found, off_s
+    return found
 
 
-def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_ns: int) -> list[str]:
+def _enabled_again(run: LockstepRun, events: Sequence[Event], start_ns: int, period_ns: int) -> list[str]:
     """The power stage comes on at most once, but for what the wire does by itself.
 
     A frame may have been under way when the loop gave up; a corrupted one may say "enable", until a sound one comes.
@@ -431,32 +462,51 @@ def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_n
     if not len(asked):
         return [f"enabled although the loop never asked ({len(rises)} times)"]
     last_row = (int(run.log.time_ns[asked[-1]]) - start_ns) // period_ns
-    wire_s = {FaultKind.RPDO_DELAYED: scenario.magnitude, FaultKind.RPDO_CORRUPTED: scenario.duration_s}
-    late = 2 + int(wire_s.get(scenario.kind, 0.0) * 1e9 / period_ns)
+    wire_s = magnitude_of(events, FaultKind.RPDO_DELAYED)
+    wire_s += sum(event.duration_s for event in events if event.kind is FaultKind.RPDO_CORRUPTED)
+    late = 2 + int(wire_s * 1e9 / period_ns)
     if rises[-1] > last_row + late:
         return [f"enabled again {(rises[-1] - last_row) * period_ns * 1e-6:.0f} ms after the loop had stopped asking"]
     return []
 
 
-def wrong_cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int) -> list[str]:
-    fault, expected = run.fault, FAULT_CLASSES[scenario.kind]
-    if scenario.harmless:
-        return [] if fault is Fault.NONE else [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
+def causes_of(events: Sequence[Event]) -> frozenset[Fault]:
+    """What the loop may name."""
+    classes = [FAULT_CLASSES[event.kind] for event in events]
+    late = LATE_CAUSES if any(item.on_wire for item in classes) else frozenset()
+    return late.union(*(item.causes for item in classes))
+
+
+def _not_noticed(run: LockstepRun, event: Event, period_s: float, start_ns: int) -> bool:
+    if event.harmless or not FAULT_CLASSES[event.kind].certain:
+        return False
+    powered = (run.log.phase >= AxisPhase.APPROACH) & (run.log.phase <= AxisPhase.RELEASING)
+    watched = (np.asarray(run.log.time_ns)[powered] - start_ns) * 1e-9
+    sizes = FAULT_CLASSES[event.kind].harmful
+    noticed_s = NOTICED_s if sizes is None else max(NOTICED_s, sizes.duration_s[0])
+    noticed_s += event.duration_s if event.kind is FaultKind.LOOP_HELD_UP else 0.0
+    return len(watched) > 0 and watched[0] < event.at_s - period_s and event.at_s + noticed_s < watched[-1]
+
+
+def wrong_cause(
+    run: LockstepRun, events: Sequence[Event], period_s: float, start_ns: int, *, twin: bool = False,
+    also: frozenset[Fault] = frozenset(),
+) -> list[str]:  # fmt: skip
+    """`events`: of the joint, and of the computer; `twin`: the only one is harmless; `also`: causes besides theirs."""
+    fault, code = run.fault, int(run.state.fault_drive_error)
     if fault is Fault.NONE:
-        times = (np.asarray(run.log.time_ns) - start_ns) * 1e-9
-        moving = (run.log.phase >= AxisPhase.APPROACH) & (run.log.phase <= AxisPhase.TRACKING)
-        tracked = times[moving]
-        noticed_s = NOTICED_s + (scenario.duration_s if scenario.kind is FaultKind.LOOP_HELD_UP else 0.0)
-        due = len(tracked) and tracked[0] < scenario.at_s - period_s and scenario.at_s + noticed_s < tracked[-1]
-        return ["the fault was not noticed"] if expected.certain and due else []
-    causes = expected.causes | LATE_CAUSES if expected.on_wire else expected.causes
-    if fault not in causes:
+        unnoticed = any(_not_noticed(run, event, period_s, start_ns) for event in events)
+        return ["the fault was not noticed"] if unnoticed else []
+    if twin:
+        return [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
+    if fault not in causes_of(events) | also:
         return [f"the cause is reported as {fault.name} (={run.state.fault_value:.4f})"]
-    code = int(run.state.fault_drive_error)
-    if fault is Fault.DRIVE_NOT_ENABLED and expected.emergency not in (0, code):
-        return [f"the drive's error code is reported as {code:04X}h, not {expected.emergency:04X}h"]
-    if scenario.kind is FaultKind.DRIVE_FAULT and run.state.fault_drive_error != scenario.magnitude:
-        return [f"the drive's error code is reported as {int(run.state.fault_drive_error):04X}h"]
+    codes = {FAULT_CLASSES[one.kind].emergency for one in events if fault in FAULT_CLASSES[one.kind].causes}
+    if fault is Fault.DRIVE_NOT_ENABLED and codes and not codes & {0, code}:
+        return [f"the drive's error code is reported as {code:04X}h, not {min(codes):04X}h"]
+    of_drive = {one.magnitude for one in events if one.kind is FaultKind.DRIVE_FAULT}
+    if of_drive and fault is Fault.DRIVE_FAULT and code not in of_drive and len(events) == 1:
+        return [f"the drive's error code is reported as {code:04X}h"]
     return []
 
 
@@ -467,13 +517,13 @@ def fault_row_of(run: LockstepRun, start_ns: int, period_ns: int) -> int:
 
 
 def wrong_of_joint(
-    run: LockstepRun, allowed: Envelope, scenario: Scenario, fault_row: int, start_ns: int, period_ns: int,
+    run: LockstepRun, allowed: Envelope, events: Sequence[Event], fault_row: int, start_ns: int, period_ns: int,
     *, by_position: bool = False,
 ) -> tuple[list[str], float | None]:  # fmt: skip
     """What holds for any joint, whatever the fault: (violations, time from `fault_row` until off and at rest)."""
-    ending, off_s = _ending(run, allowed, fault_row, period_ns * 1e-9)
-    again = _enabled_again(run, scenario, start_ns, period_ns)
-    return [*_commands(run, allowed, by_position=by_position), *_motion(run, allowed), *ending, *again], off_s
+    late, off_s = _time_off(run, allowed, events, fault_row, period_ns * 1e-9)
+    found = [*_commands(run, allowed, by_position=by_position), *_motion(run, allowed), *_ending(run, events), *late]
+    return found + _enabled_again(run, events, start_ns, period_ns), off_s
 
 
 def beyond_rad(run: LockstepRun, limits: LimitConstants) -> float:
@@ -486,7 +536,7 @@ def _ends_by_itself(
     config: Config, joint: LockstepJoint, scenario: Scenario, fault: Fault, place: PlaceStep | None
 ) -> bool:
     """A harmless fault in a step of a tune that ends in the same way without it: its law knows no friction yet."""
-    if not (scenario.harmless and fault is not Fault.NONE and isinstance(scenario.trajectory, TuneStep)):
+    if not (scenario.twin and fault is not Fault.NONE and isinstance(scenario.trajectory, TuneStep)):
         return False
     alone, _ = run_scenario(config, joint, replace(scenario, at_s=NEVER_s), place)
     return alone.fault is fault
@@ -500,20 +550,23 @@ def judge(config: Config, joint: LockstepJoint, scenario: Scenario, place: Place
     period_s = float(axis.law.period_s)
     period_ns = round(period_s * 1e9)
     start_ns = int(joint.start_ns)
-    allowed = envelope(config, scenario, axis, joint.quick_stop_radps2)
+    peak_radps = float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max())
+    allowed = envelope(config, scenario, axis, joint.quick_stop_radps2, peak_radps)
     fault_row = fault_row_of(run, start_ns, period_ns)
     by_position = int(axis.command_kind) == CommandKind.POSITION
-    wrong, off_s = wrong_of_joint(run, allowed, scenario, fault_row, start_ns, period_ns, by_position=by_position)
+    events = scenario.events
+    wrong, off_s = wrong_of_joint(run, allowed, events, fault_row, start_ns, period_ns, by_position=by_position)
     if not _ends_by_itself(config, joint, scenario, run.fault, place):
-        wrong += wrong_cause(run, scenario, period_s, start_ns)
+        wrong += wrong_cause(run, events, period_s, start_ns, twin=scenario.twin)
     return Verdict(
         number=scenario.number,
         kind=scenario.kind.name.lower(),
-        harmless=scenario.harmless,
+        harmless=scenario.twin,
+        then=scenario.then(scenario.second),
         fault=run.fault.name,
         reaction=Reaction(int(run.state.reaction)).name,
         violations=tuple(wrong),
-        peak_radps=float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max()),
+        peak_radps=peak_radps,
         beyond_rad=beyond_rad(run, axis.limits),
         allowed_rad=allowed.position_max_rad - float(axis.limits.position_max_rad),
         off_s=off_s,

@@ -35,6 +35,9 @@ class Drawn:
     count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000
     seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST)] = 1
     scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)] = None
+    pairs: Annotated[bool, typer.Option("--pairs", help="two faults in each, the second up to 2 s after the first")] = (
+        False
+    )
 
 
 AS_USUAL = Drawn()
@@ -105,16 +108,16 @@ def fault_campaign(
         require_simulated(config, "fault-campaign")
         require_fit(config)
     if drawn.scenario is not None:
-        return _replay(config, output, seed, drawn.scenario, during)
+        return _replay(config, output, drawn, during)
     if report is not None:
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(drawn.count)) as advance:
         verdicts, elapsed_s, interrupted = run_campaign(
-            config, seed, drawn.count, advance, workers or HERE, during, place_of(during)
+            config, seed, drawn.count, advance, workers or HERE, during, place_of(during), pairs=drawn.pairs
         )
     rows = rows_by_kind(verdicts)
-    found = violations(config, verdicts, seed, during)
+    found = violations(config, verdicts, seed, during, pairs=drawn.pairs)
     joints = config.joints if isinstance(config, ArmConfig) else (config,)
     figure = campaign_figure(verdicts, max(joint.limits.velocity_max_radps for joint in joints))
     if verdicts:
@@ -129,15 +132,20 @@ def fault_campaign(
         _write_page(report, config, verdicts, found, figure, seed, output)
     output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
     for item in found[:SHOWN]:
-        output.warning(f"scenario {item['number']} ({item['kind']}): {'; '.join(item['violations'])}")
+        output.warning(f"scenario {item['number']} ({_told(item)}): {'; '.join(item['violations'])}")
     if found:
         output.error(
             f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
-            f"replay one with: jointctl fault-campaign {config.path}{'' if during == 'run' else f' --{during}'} "
-            f"--seed {seed} --scenario {found[0]['number']}",
+            f"replay one with: jointctl fault-campaign {config.path}{'' if during == 'run' else f' --{during}'}"
+            f"{' --pairs' if drawn.pairs else ''} --seed {seed} --scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS
     return INTERRUPTED if interrupted else 0
+
+
+def _told(item: dict[str, Any]) -> str:
+    """The faults of a violation."""
+    return f"{item['kind']}, {item['then']}" if item["then"] else str(item["kind"])
 
 
 def place_of(during: During) -> PlaceStep | None:
@@ -203,7 +211,7 @@ def _write_page(
     said = f"{len(found)} of {len(verdicts)} scenarios violate an invariant, seed {seed}."
     listed = Table(
         ["scenario", "kind", "violations"],
-        [(item["number"], item["kind"], "; ".join(item["violations"])) for item in found],
+        [(item["number"], _told(item), "; ".join(item["violations"])) for item in found],
     )
     points = svg_figure(figure, "Greatest speed, and time until off, of each scenario by kind of fault")
     sections = [
@@ -216,11 +224,12 @@ def _write_page(
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
 
 
-def _replay(config: Config | ArmConfig, output: Output, seed: int, number: int, during: During) -> int:
+def _replay(config: Config | ArmConfig, output: Output, drawn: Drawn, during: During) -> int:
     """One scenario, with all that it consists of."""
     from jointctl.tools.experiments.campaign import judge_of, scenario_of
 
-    chosen = scenario_of(config, seed, number, during)
+    assert drawn.scenario is not None
+    chosen = scenario_of(config, drawn.seed, drawn.scenario, during, pairs=drawn.pairs)
     verdict = judge_of(config, during, place_of(during))(chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]

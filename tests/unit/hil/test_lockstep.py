@@ -15,7 +15,7 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from jointctl.hil.faults import fault_memory, no_faults
+from jointctl.hil.faults import fault_rows, no_faults
 from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, Scenario, World, run_lockstep
 from jointctl.hil.virtual_bus import FrameQueue
 from jointctl.tools.lockstep import DirectBus, LockstepJoint, codec_of
@@ -52,8 +52,8 @@ class Lockstep:
             np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
         )  # fmt: skip
         world = World(
-            device.device, device.plant_constants, device.plant_state, new(FrameQueue), no_faults(),
-            fault_memory(no_faults()),
+            device.device, device.plant_constants, device.plant_state, new(FrameQueue),
+            *fault_rows([no_faults()]),
         )  # fmt: skip
         scenario = Scenario(self.start_ns, PERIOD_ns, cycles, stop_cycle, log_every=log_every)
         written, _ = run_lockstep(memory, self.codec, world, scenario)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
-from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults import FaultConstants, FaultKind
+from jointctl.hil.faults import FaultKind, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.analysis.arm_check import joint_loop, joint_loops, pose_ranges, require_budgets
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
@@ -21,6 +20,7 @@ from jointctl.tools.virtual_joint import arm_plant_of
 from tests.arms import long_arm
 from tests.bench.arm_study import KINDS, SPEEDS, random_arm, rmse_mrad
 from tests.bench.arm_study import run as run_study
+from tests.made_faults import one_fault
 
 TRACKED_s = 6.0
 
@@ -99,10 +99,9 @@ def on_two_buses(arm: ArmConfig) -> ArmConfig:
 def test_a_bus_that_is_lost_stops_the_joints_of_both(arm: LockstepArm, faulty: int, lost: set[str]) -> None:
     given = on_two_buses(arm.arm)
     joints, constants = LockstepArm(given), arm.constants()
-    fault = new(FaultConstants)
-    fault[0].kind, fault[0].start_s, fault[0].duration_s = FaultKind.BUS_OFF, 3.0, 1e6
+    faults = [one_fault(FaultKind.BUS_OFF, 3.0) if axis == faulty else no_faults() for axis in range(3)]
     plants = joints.plant_constants, joints.plant_state
-    runs = joints.run_with_faults(fault, faulty, constants, plants, arm_plant_of(given), longest_s=12.0, tail_s=1.0)
+    runs = joints.run_with_faults(faults, constants, plants, arm_plant_of(given), longest_s=12.0, tail_s=1.0)
     first = [int(np.argmax(run.log.fault != 0)) if run.log.fault.any() else 1 << 30 for run in runs]
     blamed = {name for name, row in zip(given.names, first, strict=True) if row == min(first)}
     assert blamed == lost
