@@ -17,6 +17,7 @@ import contextlib
 import logging
 import mmap
 import struct
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +38,7 @@ from canopen.sdo.exceptions import SdoCommunicationError
 from jointctl import live_joint as live_joint_module
 from jointctl.drivers.canopen import drive as drive_module
 from jointctl.drivers.canopen import switch_off as switch_off_module
+from jointctl.drivers.canopen.cia import SDO_ANSWER_ID
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.switch_off import stop_node
 from jointctl.drivers.drive import DriveGroup
@@ -72,6 +74,7 @@ SHORT_NAP_s, OFF_NAP_s = 0.05, 0.25  # a supervisor that looks often does so les
 LONGEST_CHUNK = 250  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
 LOOK_s = 0.005
+GENERAL_ERROR = 0x0800_0000  # SDO abort code
 SUPERVISOR, SESSION = "supervisor", "session"  # the second: a thread of the first, where that is a user's program
 SWITCHING_OFF = "switching off "  # threads of the first, one a drive of an arm
 _FRAME = struct.Struct("<IB3x8s")
@@ -98,6 +101,7 @@ class World:
         self.frames = 0
         self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
         self.lost_to_drive = self.lost_from_drive = False
+        self.sdo_refused = False  # the drives answer each request with an abort
         self.cut_off: int | None = None  # the axis whose drive is on the bus no more
         self.off_bus: int | None = None  # of which the computer's adapter is off
         self.fast = False  # frame by frame no more: whole cycles of the loop in one compiled call
@@ -240,6 +244,8 @@ class World:
 
     def _from_drive(self, axis: int, frame: bytes) -> None:
         identifier, size, data = _FRAME.unpack(frame)
+        if self.sdo_refused and identifier - SDO_ANSWER_ID in range(1, 128):
+            data = b"\x80" + data[1:4] + struct.pack("<L", GENERAL_ERROR)
         if not self.lost_from_drive and not self._is_cut_off(axis):
             for ear in list(self.ears):
                 if ear.bus in (self.bus[axis], None):
@@ -479,8 +485,8 @@ def stop_of_this_computer(world: World, signals: StopSignals, places: Places) ->
 
 def stop_of_another_computer(world: World, places: Places) -> None:
     """The frames alone."""
-    for bus, node in places:
-        world.start(f"stop {node}", partial(stop_node, bus, node, sleep=world.sleep))  # type: ignore[arg-type]
+    for bus, node in places:  # each command is a program of its own
+        world.start(f"stop {node} after frame {world.frames}", partial(stop_node, bus, node, sleep=world.sleep))  # type: ignore[arg-type]
 
 
 class SimulatedGroup(DriveGroup):
@@ -541,7 +547,7 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
         return loops[-1]
 
     made = type("Loop", (SimulatedLoop,), {"world": world})
-    threads = SimpleNamespace(Thread=partial(SimulatedThread, world), Event=partial(SimulatedEvent, world))
+    threads = SimpleNamespace(Event=partial(SimulatedEvent, world), main_thread=threading.main_thread)
     private = SimpleNamespace(mmap=lambda fd, size: mmap.mmap(fd, size, flags=mmap.MAP_PRIVATE))
     with contextlib.ExitStack() as stack:
         for place, name, value in (
@@ -560,6 +566,8 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
             (run_watch_module, "beside", at_once),
             (session_module, "RunLogWriter", SilentLog),
             (live_joint_module, "threading", threads),
+            (live_joint_module, "os", SimpleNamespace(getpid=lambda: 0)),  # a fork of the world has all that is in it
+            (live_joint_module, "_SessionThread", partial(SimulatedThread, world)),
         ):
             stack.callback(setattr, place, name, getattr(place, name))
             setattr(place, name, value)

@@ -1,7 +1,7 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
     python tests/bench/every_frame.py [--kind run|sweep|program|arm] [--mode cst|csp|csv] [--deadline yes|no]
-                                      [--buses 1] [--every 1] [--offset 0] [--rest 20]
+                                      [--buses 1] [--every 1] [--offset 0] [--rest 20] [--pairs SEED]
                                       [--workers 2] [--phase NAME] [--injection NAME]
                                       [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
@@ -10,7 +10,8 @@ time, frame by frame; `program` is a user's program that sends set-points throug
 shipped arm, where what is done to one drive is done to that of the middle joint; with `--buses 2` its wrist is on a
 second bus, and either adapter goes off its bus.  Right after frame k
 the process is forked for each injection; the child carries the run on to its end and judges it, the parent goes on as
-if nothing had been.  `--rest N`: every Nth frame where nothing changes: while the loop waits with the drive off, and
+if nothing had been.  `--pairs SEED`: each time a second injection follows, drawn at random, on any joint, 0.5 ms to 2 s
+after the first.  `--rest N`: every Nth frame where nothing changes: while the loop waits with the drive off, and
 from 100 ms after enabling until the stop.  Exit code 1 on a violation.
 """
 
@@ -29,9 +30,10 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,6 +49,7 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm  #
 from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.experiments.fault_scenarios import SECOND_AFTER_s  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.session.control import (  # noqa: E402
     STOP_COMMAND,
@@ -76,6 +79,7 @@ FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
 ENABLING_s = 0.05  # another controller's write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
+WHOLE_s = 2.0  # approach and motion
 SET_POINTS, SET_POINT_s, SWING_rad = 30, 0.01, 0.01
 WARM_UP = ("stop", "NMT stop", "SDO 6007 = 0", "frames to the drive lost")
 # What is waited for, shorter than on a joint: the time that is allowed follows.
@@ -93,6 +97,12 @@ class Scene:
     carried_out: Callable[[], RunResult | None]  # the whole of the supervisor's program
     outcome: str = ""  # how the supervisor ended: "" while it runs
     text: str = ""
+    axis: int = 0  # of the joint that an injection is for, if it is for one
+    second: str = ""  # the injection that follows
+    powered: bool = False  # at the second one
+
+    def __post_init__(self) -> None:
+        self.axis = len(self.joints) // 2
 
     @property
     def config(self) -> Config:
@@ -102,11 +112,6 @@ class Scene:
     def places(self) -> list[tuple[int, int]]:
         """Bus and node of each drive."""
         return [(bus, canopen_section(c).node) for bus, c in zip(self.world.bus, self.joints, strict=True)]
-
-    @property
-    def axis(self) -> int:
-        """Of the joint that an injection is for, if it is for one."""
-        return len(self.joints) // 2
 
     def send(self, identifier: int, data: bytes) -> None:
         """A frame of another program on the bus of that joint."""
@@ -136,6 +141,19 @@ class Scene:
         if not (INJECTIONS[injection].of_one_drive or injection.startswith(OF_ONE_DRIVE)):
             return True
         return f"node {self.node}" in self.text or self.joints[self.axis].path.stem in self.text
+
+    def then(self, injections: Sequence[str], seed: str) -> None:
+        """Draw a second injection, and a program that makes it."""
+        random = Random(seed)
+        self.second, axis = random.choice(injections), random.randrange(len(self.joints))
+        at_ns = self.world.now_ns + round(1e9 * math.exp(random.uniform(*map(math.log, SECOND_AFTER_s))))
+
+        def inject() -> None:
+            self.world.sleep_until_ns(at_ns)
+            self.axis, self.powered = axis, self.world.powered
+            INJECTIONS[self.second].act(self)
+
+        self.world.start("second injection", inject)
 
     def carry_out(self) -> None:
         """The supervisor's program."""
@@ -215,6 +233,11 @@ def by_heartbeat(config: Config) -> float:
     return 20.0 / config.loop.rate_Hz + canopen_section(config).heartbeat_s + config.limits.sample_age_max_s
 
 
+def to_the_end(config: Config) -> float:
+    """Of the run, which need not be ended."""
+    return WHOLE_s + by_ramp(config)
+
+
 def by_silence(config: Config) -> float:
     return config.stream.client_timeout_s + by_ramp(config)
 
@@ -230,6 +253,7 @@ SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSI
            "timed out")  # fmt: skip
 HANGS = "the program hangs"  # but the session's thread goes on
 CUT_OFF = "one drive is cut off"
+REFUSED = "all SDO requests refused"
 FIRST_OFF, LAST_OFF = "adapter off the first bus", "adapter off the last bus"
 INJECTIONS = {
     "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.places), at_once, (STOP_COMMAND,)),
@@ -257,10 +281,22 @@ INJECTIONS = {
     CUT_OFF: Injection(
         lambda s: setattr(s.world, "cut_off", s.axis), by_heartbeat, SILENCE, may_enable=True, of_one_drive=True
     ),
+    REFUSED: Injection(lambda s: setattr(s.world, "sdo_refused", True), to_the_end, may_enable=True),
     FIRST_OFF: Injection(switch_bus_off(0), by_heartbeat, (*SILENCE, "BUS"), may_enable=True),
     LAST_OFF: Injection(switch_bus_off(-1), by_heartbeat, (*SILENCE, "BUS"), may_enable=True),
 }
-OF_ONE_DRIVE = ("NMT ", "SDO ")  # begin the names of these
+OF_ONE_DRIVE = ("NMT ", "SDO 1", "SDO 6")  # begin the names of these
+
+
+# what takes the drive's watchdog away, and after what no one else is left
+DISARMING = {"SDO 1016:1 = 0", "SDO 1400:5 = 0", "SDO 6007 = 0"}
+LEFT_ALONE = {"both die", "loop dies", "frames to the drive lost", CUT_OFF, FIRST_OFF, LAST_OFF}
+
+
+def beyond_help(session: Scene, first: str) -> bool:
+    """Both at once, while the drive has power: another controller has switched off the last who would stop it."""
+    both = {first, session.second}
+    return session.powered and bool(both & DISARMING) and bool(both & LEFT_ALONE)
 
 
 @dataclass
@@ -288,10 +324,15 @@ def judge(
     """After the run has ended; `powered` is the drive's power at the injection, `changes` are those after it."""
     world, config, injection = session.world, session.config, INJECTIONS[name]
     sequence = config.sequence
-    allowed_s = injection.reaction_s(config) + sequence.stop_timeout_s + sequence.off_timeout_s
+    both = (injection, INJECTIONS[session.second]) if session.second else (injection,)
+    causes = [cause for one in both for cause in one.causes]
+    allowed_s = sum(one.reaction_s(config) for one in both) + sequence.stop_timeout_s + sequence.off_timeout_s
     off_ns = max((time_ns for time_ns, on in changes if not on), default=injected_ns)
-    verdict = Verdict(frame, phase, name, (off_ns - injected_ns) * 1e-9, session.outcome, session.text[:300])
+    told = f"{name}, then {session.second}" if session.second else name
+    verdict = Verdict(frame, phase, told, (off_ns - injected_ns) * 1e-9, session.outcome, session.text[:300])
     problems = verdict.problems
+    if beyond_help(session, name):
+        return verdict
     if world.powered:
         problems.append("the drive has power at the end")
     if verdict.off_after_s > allowed_s:
@@ -308,7 +349,9 @@ def judge(
     elif ons and not injection.may_enable:
         problems.append(f"enabled {(ons[0] - injected_ns) * 1e-6:.1f} ms after it")
     elif (
-        len(ons) > 1 or (ons and powered) or (late and name != "supervisor dies" and name != "frames of the drive lost")
+        len(ons) > 1
+        or (ons and powered)
+        or (late and name not in ("supervisor dies", "frames of the drive lost", REFUSED))
     ):
         problems.append(f"enabled again {(ons[-1] - injected_ns) * 1e-6:.1f} ms after it")
     if world.enabled_unproven:
@@ -316,9 +359,11 @@ def judge(
     if injection.causes and session.outcome not in ("",) and phase != "switching off":
         if session.outcome == "done" and phase not in ("disabling", "finished"):
             problems.append("the run went on as if nothing had been")
-        elif session.outcome != "done" and not any(cause in session.text for cause in injection.causes):
+        elif session.outcome != "done" and not any(cause in session.text for cause in causes):
             problems.append(f"the message does not name the cause: {session.outcome}: {session.text[:200]}")
-        elif session.outcome != "done" and len(session.joints) > 1 and not session.names_joint(name):
+        elif (
+            session.outcome != "done" and len(session.joints) > 1 and not (session.second or session.names_joint(name))
+        ):
             problems.append(f"the message does not name the joint: {session.outcome}: {session.text[:200]}")
     return verdict
 
@@ -410,6 +455,7 @@ class Exhaustion:
     ) -> None:  # fmt: skip
         self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
         self.child, self.mode, self.buses = False, mode, buses
+        self.pairs = 0  # the seed, or none
         self.parent = os.getppid()  # ends with it: no one would read what this finds
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
@@ -510,6 +556,8 @@ class Exhaustion:
             world = self.session.world
             world.fast, world.long_naps = True, phase != "commissioning"
             self.why = (name, number, phase, world.now_ns, world.powered, len(world.power_changes))
+            if self.pairs:
+                self.session.then(self.injections, f"{self.pairs} {number} {name}")
             INJECTIONS[name].act(self.session)
             return
 
@@ -534,7 +582,7 @@ def report(rows: list[dict[str, Any]], frames: dict[str, int], elapsed_s: float)
     bad = [row for row in rows if row["problems"]]
     for row in rows:
         if "off_after_s" in row:
-            times[row["injection"]].append(row["off_after_s"])
+            times[row["injection"].split(",")[0]].append(row["off_after_s"])
     print(f"{len(rows)} injections after the frames of {', '.join(f'{k} ({n} frames)' for k, n in frames.items())}; "
           f"{elapsed_s:.0f} s; simulated")  # fmt: skip
     print(f"{'injection':28} {'number':>7} {'with power':>10} {'off after, median':>18} {'99 %':>8} {'longest':>8}")
@@ -581,6 +629,7 @@ def main() -> int:
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--offset", type=int, default=0, help="other ones of them: so many frames earlier")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
+    parser.add_argument("--pairs", type=int, default=0, metavar="SEED", help="a second injection after each; from 1")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler whose workers have this clone at this path")
     parser.add_argument("--parts", type=int, help="shares of the frames; default: four times the processors here")
@@ -604,7 +653,7 @@ def main() -> int:
             given.buses,
         )
         one.phases, one.injections = given.phase or [], given.injection or one.injections
-        one.chosen = given.offset
+        one.chosen, one.pairs = given.offset, given.pairs
         sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
         return 0
     workers = Workers(given.workers, given.cluster)
@@ -623,6 +672,7 @@ def main() -> int:
                 "--rest",
                 str(given.rest),
                 f"--offset={given.offset}",
+                f"--pairs={given.pairs}",
                 *(f"--phase={name}" for name in given.phase or []),
             ]
             words += [f"--injection={name}" for name in given.injection or []]

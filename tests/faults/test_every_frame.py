@@ -1,4 +1,4 @@
-"""A stop, a death, another controller or a loss after a sample of the frames of a simulated run, of a joint or an arm.
+"""A stop, a death, another controller or a loss, or two, after a sample of the frames of a joint's or an arm's run.
 
 The whole, after every frame: tests/bench/every_frame.py.
 """
@@ -13,14 +13,16 @@ import pytest
 
 from tests.places import ROOT
 
-SAMPLE = {("run", "yes"): "110", ("run", "no"): "230", ("arm", "yes"): "700"}  # every so many of the frames
+# every so many of the frames, and the seed of a second injection
+SAMPLE = {("run", "yes"): ("110", "0"), ("program", "no"): ("110", "1"), ("arm", "yes"): ("700", "2")}
 
 
 @pytest.mark.parametrize(("kind", "deadline"), SAMPLE)
 def test_after_any_frame_the_joint_is_off_in_time_and_stays_off(kind: str, deadline: str) -> None:
     """`deadline`: whether the drive has 1400:5.  Of an arm every drive must be off."""
     command = [sys.executable, str(ROOT / "tests" / "bench" / "every_frame.py"), "--kind", kind]
-    command += ["--deadline", deadline, "--every", SAMPLE[kind, deadline], "--workers", "1"]
+    every, pairs = SAMPLE[kind, deadline]
+    command += ["--deadline", deadline, "--every", every, "--pairs", pairs, "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600.0, check=False)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     found = re.search(r"^(\d+) injections", done.stdout, re.MULTILINE)
