@@ -8,13 +8,15 @@ exchange needs no transformation: spatial vectors (turn, shift of the point at t
 shares the links' figures with the controller's model, and none of its code.
 
 M^-1 and a0 are made anew every `REFRESH_SUBSTEPS`, for where the arm will be in the middle of that time; torques act
-in every substep.  A drive without power holds its joint with a brake, a spring and damper to where it closed.
+in every substep.  A drive without power holds its joint with a brake, if it has one, a spring and damper to where it
+closed.
 
 Not modelled: set-valued friction (`FrictionKind.STICK_SLIP`), the gyroscopic torque of the motors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -51,7 +53,8 @@ class JointOfArm:
     """One joint with its link; vectors in coordinates of the base."""
 
     target_Nm: f8  # what the drive asks for
-    braked: i4  # the drive has no power
+    has_brake: i4
+    braked: i4  # it is closed: the drive has no power
     held: i4  # of the drive: its torque stays until something happens
     brake_rad: f8  # where it closed
     torque_Nm: f8  # on the link, in this substep
@@ -87,14 +90,19 @@ def no_arm_plant() -> ArmPlant:
     return ArmPlant(new(ArmPlantConstants), new(ArmLink, 0), new(JointOfArm, MOST_JOINTS + 1), np.zeros(1, np.int64))
 
 
-def arm_plant(links: np.ndarray, gravity_mps2: tuple[float, ...]) -> ArmPlant:
-    """Links as the arm truly has them, at rest and braked; of a flexible joint the motor is not the link's."""
+def arm_plant(links: np.ndarray, gravity_mps2: tuple[float, ...], brakes: Sequence[bool] = ()) -> ArmPlant:
+    """Links as the arm truly has them, at rest and braked; of a flexible joint the motor is not the link's.
+
+    `brakes`: of each joint whether it has one; by default all have.
+    """
     if len(links) > MOST_JOINTS:
         raise ValueError(f"joints of an arm (={len(links)}) must be at most {MOST_JOINTS}")
     constants, joints = new(ArmPlantConstants), new(JointOfArm, len(links) + 1)
     constants[0].gravity_mps2[:] = gravity_mps2
+    joints.has_brake[:-1] = brakes or 1
+    joints.braked[:] = joints.has_brake
     for joint, link in zip(joints, links, strict=False):
-        joint.braked, joint.brake_rad, joint.motor_inertia_kgm2 = 1, math.nan, link.motor_inertia_kgm2
+        joint.brake_rad, joint.motor_inertia_kgm2 = math.nan, link.motor_inertia_kgm2
     joints[-1].turn[:] = np.eye(3)
     return ArmPlant(constants, links.copy(), joints, np.zeros(1, np.int64))
 

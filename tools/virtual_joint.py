@@ -140,7 +140,8 @@ def arm_plant_of(arm: ArmConfig) -> ArmPlant:
         for name in ("mass_kg", "moment_kgm", "inertia_kgm2"):
             link[name] *= scale
         link.motor_inertia_kgm2 *= 0.0 if config.virtual.flexible else scale
-    return arm_plant(links, tuple(arm.arm.gravity_mps2))
+    brakes = [config.virtual is not None and config.virtual.brake for config in arm.joints]
+    return arm_plant(links, tuple(arm.arm.gravity_mps2), brakes)
 
 
 def device_settings(config: Config) -> DeviceSettings:

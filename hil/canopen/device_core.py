@@ -399,7 +399,7 @@ def advance_together(
                 torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queues[index])
                 joint.target_Nm = torque_Nm
                 joint.held = 1 if held else 0
-                joint.braked = 0 if is_powered(device) else 1
+                joint.braked = 0 if is_powered(device) else joint.has_brake
             if len(arm.links) == 0:
                 step_plant(plant_c, plant_s, joint.target_Nm)
         if len(arm.links) > 0:

@@ -1,6 +1,7 @@
 """Configurations that a campaign is run with beside the shipped ones: one line changed each, or two.
 
-`python -m tests.faults.campaign_variants FOLDER` writes them, for `jointctl fault-campaign FOLDER/NAME.toml`.
+`python -m tests.faults.campaign_variants FOLDER` writes them, for `jointctl fault-campaign FOLDER/NAME.toml`, and an
+arm without brakes, for `jointctl fault-campaign FOLDER/brakeless/arm.toml`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import re
 import sys
 from pathlib import Path
 
+from jointctl.tools.configuration.arm import SHIPPED_ARM
 from tests.places import CONFIGS
 
 OWN_LOOP = (  # the drive closes its own loops
@@ -44,6 +46,18 @@ def write_variant(name: str, folder: Path) -> Path:
     return path
 
 
+def write_brakeless_arm(folder: Path) -> Path:
+    """The shipped arm on its side, no joint with a brake: its friction alone holds it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in SHIPPED_ARM.parent.iterdir():
+        text = path.read_text()
+        text = text.replace("gravity_mps2 = [0.0, 0.0, -9.81]", "gravity_mps2 = [0.0, -9.81, 0.0]")
+        text = re.sub(r"(?m)^\[virtual\].*$", "[virtual]\nbrake = false", text)
+        (folder / path.name).write_text(text)
+    return folder / SHIPPED_ARM.name
+
+
 if __name__ == "__main__":
+    print(write_brakeless_arm(Path(sys.argv[1]) / "brakeless"))
     for name in VARIANTS:
         print(write_variant(name, Path(sys.argv[1])))

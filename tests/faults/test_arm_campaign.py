@@ -33,6 +33,8 @@ from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, kinds_duri
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 from jointctl.tools.verbs.fault_campaign import Drawn, fault_campaign
+from tests.bench.arm_study import random_arm
+from tests.faults.campaign_variants import write_brakeless_arm
 from tests.sessions import output
 from tests.unit.hil.test_lockstep_arm import on_two_buses
 
@@ -84,6 +86,25 @@ def test_no_pair_violates_an_invariant(arm: ArmConfig, joints: LockstepArm, mass
     assert [(v.number, v.kind, v.then, v.violations) for v in found if v.violations] == []
     assert {one.second[0] for one in drawn if one.second is not None} == {0, 1, 2}
     assert sum(v.fault != "NONE" for v in found) > len(found) // 3
+
+
+@pytest.mark.slow("two more arms, whose drives are watched for longer")
+@pytest.mark.parametrize("kind", ["brakeless", "flexible"])
+def test_no_scenario_violates_an_invariant_with_other_arms(arm: ArmConfig, tmp_path: Path, kind: str) -> None:
+    """On its side and without brakes; with soft reducers and two encoders a joint."""
+    other = random_arm(arm, 1, 0, flexible=True) if kind == "flexible" else load_arm(write_brakeless_arm(tmp_path))
+    require_arm_fits(other)
+    joints, masses = LockstepArm(other), masses_of(other)
+    drawn = [draw_arm_scenario(other, 41, number, pairs=bool(number % 2)) for number in range(2 * len(KINDS))]
+    found = [judge_arm(joints, masses, one) for one in drawn]
+    assert [(v.number, v.kind, v.then, v.violations) for v in found if v.violations] == []
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 4
+
+
+def test_a_joint_without_a_brake_that_friction_does_not_hold_has_no_envelope(arm: ArmConfig) -> None:
+    loose = arm.joints[0].model_copy(update={"virtual": arm.joints[0].virtual.model_copy(update={"brake": False})})
+    with pytest.raises(ConfigurationError, match=r"gravity at shoulder \(=\d+\.\d+ Nm\) must be less than \d+\.\d+ Nm"):
+        require_arm_fits(dataclasses.replace(arm, joints=(loose, *arm.joints[1:])))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -283,7 +304,7 @@ def test_the_envelope_follows_its_derivation(arm: ArmConfig, joints: LockstepArm
     """By hand, for masses that do not depend on the pose: the elbow's drive fails, nothing else is thrown."""
     scenario = of_kind(arm, FaultKind.DRIVE_FAULT, 1, harmless=False)
     _, constants = run_arm_scenario(joints, scenario)
-    plain = Masses(np.diag([0.5, 1.25, 8.0]), np.zeros((3, 3)), np.array([30.0, 10.0, 1.0]))
+    plain = Masses(np.diag([0.5, 1.25, 8.0]), np.zeros((3, 3)), np.array([30.0, 10.0, 1.0]), np.eye(3))
     allowed = envelopes(joints, plain, scenario, constants)[1]
     push = 1.25 * (0.6 * 121.0 + 10.0 + sum(scenario.fault.plant["torque_ripple_Nm"]))
     speed, brake = 3.4 + push * 0.01, joints.quick_stop_radps2[1]

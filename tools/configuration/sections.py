@@ -501,7 +501,7 @@ Trajectory = Annotated[Sine | MinJerk | Trapezoid | Table | Hold, Field(discrimi
 # `hil.plant_records.PlantSettings`, whose checks apply too.
 
 
-OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
+OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults", "brake")
 MAX_FAULTS = 8
 # by their names in `hil.faults`, which a run on hardware does not load
 FAULT_KINDS = (
@@ -544,6 +544,7 @@ class Virtual(Section):
     step_s: Annotated[float, between(1e-6, 1e-3)] = 50e-6  # of the plant's integration
     initial_position_rad: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # where the joint stands at the start
     inertia_scale: Annotated[float, between(0.1, 10.0)] = 1.0  # true inertia over joint.inertia_kgm2
+    brake: bool = True  # in an arm: one that is closed while the drive has no power; a single joint has none
     current_limit_A: Annotated[float, between(0.001, 10_000.0)] = 100.0  # of the motor
     current_lag_s: Annotated[float, between(0.0, 1.0)] = 0.0  # of the drive's current loop, first order
     command_delay_s: Annotated[float, between(0.0, 1.0)] = 0.0  # on top of the period that the synchronous RPDO takes

@@ -20,6 +20,12 @@ for the reaction time of the fault on its joint, for that of a measured limit on
 throws the others: |M_ij| / M_ii of its speed.  The virtual arm's brakes hold, so there is no friction to be braked by:
 quick stop and ramp brake with 6085 or sequence.brake_radps2, the smaller one.  A motor that yields too little lets its
 joint fall until the drive has given up its stop ramp.
+
+Where joints have no brake, Coulomb friction F, less ripple and gravity, takes the kinetic energy T = v' M v / 2:
+
+    |v_i| <= sqrt(2 T (M^-1)_ii),   x_i <= T / F_i
+    dT/dt <= -sum_i F_i |v_i| <= -c sqrt(T),   c = min_i F_i / sqrt(M_ii / 2),   so that all stand after 2 sqrt(T) / c
+
 """
 
 from __future__ import annotations
@@ -30,6 +36,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, Reaction
@@ -61,6 +68,7 @@ from jointctl.tools.experiments.judge import (
     APPROACH_s,
     BRAKE_SPARE_s,
     Envelope,
+    RIPPLE_Nm,
     SIZED_FOR_Nm,
     SPARE_s,
     TAIL_s,
@@ -68,6 +76,7 @@ from jointctl.tools.experiments.judge import (
     beyond_rad,
     causes_of,
     fault_row_of,
+    friction_floor_Nm,
     magnitude_of,
     reaction_s,
     require_joint_fits,
@@ -92,6 +101,7 @@ COMMON = frozenset(
         FaultKind.LOOP_KILLED,
     }
 )  # fmt: skip
+LEFT_ALONE_SPEEDS = 4.0  # of limits.velocity_max_radps: what a joint reaches until its drive has given up the loop
 WEAK = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.CURRENT_LOOP_DEAD})  # the motor yields too little
 
 
@@ -157,12 +167,22 @@ def draw_arm_scenario(arm: ArmConfig, seed: int, number: int, *, pairs: bool = F
         scales.append(float(random.uniform(*INERTIA_SCALES)))
         joint = _sized(joint, size) if axis == faulty else replace(joint, kind=FaultKind.NONE)
         second = _sized(base.second, size) if base.second is not None and axis == has_second else None
+        if not has_brake(config):
+            joint, second = _held(joint, config), None if second is None else _held(second, config)
         joints.append(fitted(config, replace(joint, second=second)))
     return ArmScenario(faulty, tuple(joints), tuple(scales))
 
 
 def _sized(event: Any, size: float) -> Any:
     return replace(event, magnitude=size * event.magnitude) if event.kind in OF_TORQUE else event
+
+
+def _held(event: Any, config: Config) -> Any:
+    """A harmless load that stays must not move a joint without a brake once its power is off."""
+    if event.kind is not FaultKind.LOAD_JUMP or not event.harmless:
+        return event
+    most_Nm = 0.5 * least_friction_Nm(config)
+    return replace(event, magnitude=min(max(event.magnitude, -most_Nm), most_Nm))
 
 
 def _plant(random: np.random.Generator, config: Config, size: float) -> dict[str, Any]:
@@ -209,9 +229,15 @@ def run_arm_scenario(joints: LockstepArm, scenario: ArmScenario) -> tuple[list[L
     plants = tuple(np.concatenate([part[i] for part in parts]).view(np.recarray) for i in (0, 1))
     runs = joints.run_with_faults(
         [joint.faults() for joint in scenario.joints], constants, (plants[0], plants[1]), arm_plant_of(arm),
-        longest_s=APPROACH_s + scenario.fault.trajectory.duration_s + SPARE_s, tail_s=TAIL_s,
+        longest_s=APPROACH_s + scenario.fault.trajectory.duration_s + SPARE_s, tail_s=_tail_s(joints),
     )  # fmt: skip
     return runs, constants
+
+
+def _tail_s(joints: LockstepArm) -> float:
+    """For how long it is watched: a drive that is left alone brakes along 6085, on soft joints slowly."""
+    speeds = [config.limits.velocity_max_radps for config in joints.arm.joints]
+    return TAIL_s + LEFT_ALONE_SPEEDS * float((speeds / joints.quick_stop_radps2).max())
 
 
 # --- the envelope ---
@@ -219,11 +245,12 @@ def run_arm_scenario(joints: LockstepArm, scenario: ArmScenario) -> tuple[list[L
 
 @dataclass(frozen=True)
 class Masses:
-    """Over the poses: the greatest |M^-1|, the greatest |M_ij| / M_ii, the greatest gravity [Nm]."""
+    """Over the poses: the greatest |M^-1|, the greatest |M_ij| / M_ii, the greatest gravity [Nm], the greatest |M|."""
 
     inverse: np.ndarray
     throw: np.ndarray
     gravity_Nm: np.ndarray
+    inertia: np.ndarray
 
 
 def masses_of(arm: ArmConfig) -> Masses:
@@ -233,7 +260,8 @@ def masses_of(arm: ArmConfig) -> Masses:
     own = np.diagonal(inertias, axis1=1, axis2=2)
     throw = (np.abs(inertias) / own[:, :, np.newaxis]).max(axis=0) * high / low
     np.fill_diagonal(throw, 0.0)
-    return Masses(np.abs(np.linalg.inv(inertias)).max(axis=0) / low, throw, np.abs(gravity).max(axis=0) * high)
+    inverse = np.abs(np.linalg.inv(inertias)).max(axis=0) / low
+    return Masses(inverse, throw, np.abs(gravity).max(axis=0) * high, np.abs(inertias).max(axis=0) * high)
 
 
 def envelopes(
@@ -260,6 +288,16 @@ def envelopes(
     speeds = alone + masses.throw @ alone
     ways = speed_limits * waits + 0.5 * push * waits**2 + speeds * fall_s + speeds**2 / (2.0 * brakes)
     stops = waits + fall_s + np.minimum(speeds, reached_radps) / brakes + BRAKE_SPARE_s
+    if not all(map(has_brake, arm.joints)):
+        frictions = np.array([
+            least_friction_Nm(config) - masses.gravity_Nm[axis] for axis, config in enumerate(arm.joints)
+        ])  # fmt: skip
+        energy = 0.5 * speeds @ masses.inertia @ speeds
+        slowed = np.minimum(speeds, reached_radps)
+        least = np.min(frictions / np.sqrt(0.5 * np.diagonal(masses.inertia)))
+        stops = stops + 2.0 * np.sqrt(0.5 * slowed @ masses.inertia @ slowed) / least
+        ways = ways + energy / frictions
+        speeds = np.maximum(speeds, np.sqrt(2.0 * energy * np.diagonal(masses.inverse)))
     found = []
     for axis, config in enumerate(arm.joints):
         shift, speed = _misread(config, scenario, constants[axis], axis, float(ways[axis]))
@@ -311,10 +349,28 @@ def _envelope(config: Config, constants: np.recarray, way: float, speed: float, 
     )
 
 
+def has_brake(config: Config) -> bool:
+    return config.virtual is not None and config.virtual.brake
+
+
+def least_friction_Nm(config: Config) -> float:
+    """The Coulomb friction at the joint in the worst scenario, less what its motor may add to it."""
+    size = config.limits.torque_max_Nm / SIZED_FOR_Nm
+    return friction_floor_Nm(config) - RIPPLE_SHARE * size * RIPPLE_Nm
+
+
 def require_arm_fits(arm: ArmConfig) -> None:
     """`ConfigurationError` for an arm whose campaign would prove nothing."""
     for config in arm.joints:
         require_joint_fits(config)
+    if all(map(has_brake, arm.joints)):
+        return
+    for name, config, gravity_Nm in zip(arm.names, arm.joints, masses_of(arm).gravity_Nm, strict=True):
+        if gravity_Nm >= (held_Nm := least_friction_Nm(config)):
+            raise ConfigurationError(
+                f"{config.path}: gravity at {name} (={gravity_Nm:.2f} Nm) must be less than {held_Nm:.2f} Nm, what its "
+                "friction holds in the worst scenario, where a joint of the arm has no brake"
+            )
 
 
 # --- the invariants ---
@@ -399,7 +455,7 @@ def _wrong_report(
     else:
         return [f"the fault is reported as that of {names[earliest[0]]}, {runs[earliest[0]].fault.name}"]
     everything = [event for joint in scenario.joints for event in joint.events]
-    at_once = touching[reported] if first >= 0 else everything
+    at_once = (touching[reported] if first >= 0 else []) or everything
     # where the drive of a joint does not receive us, the heartbeat is withheld from all
     withheld = LATE_CAUSES & causes_of(everything) if scenario.second is not None else frozenset()
     wrong = wrong_cause(runs[reported], at_once, period_ns * 1e-9, start_ns, twin=scenario.twin, also=withheld)

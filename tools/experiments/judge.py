@@ -249,15 +249,20 @@ def require_joint_fits(config: Config, torque_Nm: float = 0.0) -> None:
             )
 
 
-def require_fit(config: Config) -> None:
-    """`ConfigurationError` for a configuration whose campaign would prove nothing, or find what is no violation."""
-    require_joint_fits(config, SIZED_FOR_Nm)
+def friction_floor_Nm(config: Config) -> float:
+    """The least Coulomb friction at the joint of all scenarios."""
     virtual = config.virtual
     assert virtual is not None
     friction = virtual.friction or config.friction
     assert friction is not None
     weakest_Nm = config.joint.reduction_ratio * min(abs(friction.positive.tc_Nm), abs(friction.negative.tc_Nm))
-    held_Nm = LEAST_SCALE * weakest_Nm * (1.0 - virtual.friction_ripple) - RIPPLE_Nm
+    return LEAST_SCALE * weakest_Nm * (1.0 - virtual.friction_ripple)
+
+
+def require_fit(config: Config) -> None:
+    """`ConfigurationError` for a configuration whose campaign would prove nothing, or find what is no violation."""
+    require_joint_fits(config, SIZED_FOR_Nm)
+    held_Nm = friction_floor_Nm(config) - RIPPLE_Nm
     if load_Nm(config) >= held_Nm:
         raise ConfigurationError(
             f"{config.path}: the loads of [virtual] (={load_Nm(config):g} Nm) must be less than {held_Nm:.2f} Nm, what "

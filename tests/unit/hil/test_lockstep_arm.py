@@ -12,7 +12,7 @@ from jointctl.firmware_py.arm_model import ArmFeedForward
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultKind, no_faults
-from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.analysis.arm_check import joint_loop, joint_loops, pose_ranges, require_budgets
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
@@ -93,6 +93,16 @@ def on_two_buses(arm: ArmConfig) -> ArmConfig:
     bus = wrist.bus.model_copy(update={"channel": "virtual1"})
     drive = wrist.drive.model_copy(update={"node": 1})
     return replace(arm, joints=(*others, wrist.model_copy(update={"bus": bus, "drive": drive})))
+
+
+@pytest.mark.parametrize("brake", [True, False])
+def test_a_joint_without_a_brake_falls_while_its_power_is_off(arm: LockstepArm, brake: bool) -> None:
+    """Before the start, where all drives are off: gravity is more than its friction."""
+    first = arm.arm.joints[0]
+    changed = first.model_copy(update={"virtual": first.virtual.model_copy(update={"brake": brake})})
+    given = replace(arm.arm, joints=(changed, *arm.arm.joints[1:]))
+    position = arm.run(plant=arm_plant_of(given), longest_s=0.045)[0].truth[:, TRUE_POSITION_rad]
+    assert (abs(position[-1] - position[0]) < 1e-3) == brake
 
 
 @pytest.mark.parametrize(("faulty", "lost"), [(0, {"shoulder", "elbow"}), (2, {"wrist"})])
