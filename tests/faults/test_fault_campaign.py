@@ -84,6 +84,14 @@ def test_a_damaged_report_is_not_that_of_a_drive_that_stops(config: Config, lock
     assert verdict.off_s < 0.25
 
 
+def test_a_jump_behind_a_reading_that_stands_still_need_not_be_noticed(config: Config, lockstep: LockstepJoint) -> None:
+    scenario = draw_scenario(42, 615, "program", pairs=True)
+    assert [event.kind for event in scenario.events] == [FaultKind.ENCODER_STUCK, FaultKind.ENCODER_JUMP]
+    run, _ = run_scenario(config, lockstep, scenario)
+    assert judge_module.wrong_cause(run, scenario.events, 1e-3, lockstep.start_ns) == []
+    assert judge_module.wrong_cause(run, scenario.events[1:], 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
+
+
 def test_every_kind_of_fault_has_its_class() -> None:
     assert set(FAULT_CLASSES) == set(FaultKind) - {FaultKind.NONE}
     for item in FAULT_CLASSES.values():

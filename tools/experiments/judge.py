@@ -500,7 +500,10 @@ def wrong_cause(
     """`events`: of the joint, and of the computer; `twin`: the only one is harmless; `also`: causes besides theirs."""
     fault, code = run.fault, int(run.state.fault_drive_error)
     if fault is Fault.NONE:
-        unnoticed = any(_not_noticed(run, event, period_s, start_ns) for event in events)
+        # a reading that stands still shows no jump
+        stuck = any(event.kind is FaultKind.ENCODER_STUCK for event in events)
+        seen = [event for event in events if not (stuck and event.kind is FaultKind.ENCODER_JUMP)]
+        unnoticed = any(_not_noticed(run, event, period_s, start_ns) for event in seen)
         return ["the fault was not noticed"] if unnoticed else []
     if twin:
         return [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
