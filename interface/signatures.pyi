@@ -224,6 +224,7 @@ def fault_campaign(
     count: int = 10000,
     seed: int = 1,
     scenario: int | None = None,
+    pairs: bool = False,
     sweep: bool = False,
     program: bool = False,
     tune: bool = False,

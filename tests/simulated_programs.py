@@ -17,6 +17,7 @@ import contextlib
 import logging
 import mmap
 import struct
+import tempfile
 import threading
 import time
 from collections import deque
@@ -58,6 +59,7 @@ from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
+from jointctl.tools.recording.run_summary import KeptRecords
 from jointctl.tools.session import loop_memory, portable_loop
 from jointctl.tools.session import run_watch as run_watch_module
 from jointctl.tools.session import session as session_module
@@ -565,6 +567,7 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
             (session_module, "recording", lambda _: contextlib.nullcontext()),
             (run_watch_module, "beside", at_once),
             (session_module, "RunLogWriter", SilentLog),
+            (session_module, "KeptRecords", lambda _: KeptRecords(Path(tempfile.gettempdir()))),
             (live_joint_module, "threading", threads),
             (live_joint_module, "os", SimpleNamespace(getpid=lambda: 0)),  # a fork of the world has all that is in it
             (live_joint_module, "_SessionThread", partial(SimulatedThread, world)),

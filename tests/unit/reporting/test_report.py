@@ -51,8 +51,8 @@ from tests.sessions import output
 def a_verdict(number: int) -> Verdict:
     """Harmful, harmless and a violation in turn, of three kinds."""
     violations = ("late",) if number % 5 == 0 else ()
-    return Verdict(number, f"kind_{number % 3}", number % 2 == 0, "NONE", "none", violations, 0.1 * number, 0.0, 0.1,
-                   0.01 if number % 4 else None)  # fmt: skip
+    return Verdict(number, f"kind_{number % 3}", number % 2 == 0, "NONE", "none", "", violations, 0.1 * number, 0.0,
+                   0.1, 0.01 if number % 4 else None)  # fmt: skip
 
 
 def small() -> Any:
