@@ -1,7 +1,7 @@
 """Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
-    (25, 1.7 and 3 where friction rules a rigid joint)      and lag at the late end, link at both ends of the payload
+    (25, 1.7 and 3 where friction rules the joint)          and lag at the late end, link at both ends of the payload
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
     torque noise of the encoders' counts <= a share of limits.torque_max_Nm; of a soft joint LARGEST_NOISE_Nm, some
@@ -52,7 +52,7 @@ from jointctl.tools.configuration.conversions import joint_rad_per_count, law_re
 from jointctl.tools.configuration.load import shipped_control
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
-STICKY = (25.0, 1.7, 3.0)  # the same of a rigid joint that friction rules
+STICKY = (25.0, 1.7, 3.0)  # the same of a joint that friction rules
 STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia, from where on and as from where
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
@@ -98,7 +98,7 @@ class Intervals:
     stiffness: float = 0.0
     link: float = 0.0  # of its inertia
     tells_link: bool = True  # False: its share of the inertia is a guess, at the same resonance
-    friction_radps2: float = 0.0  # no interval: static friction over the inertia of a rigid joint, see STICKY_radps2
+    friction_radps2: float = 0.0  # no interval: static friction over the inertia, see STICKY_radps2
 
 
 BELIEVED = Intervals(0.1)  # of a file that nothing was measured for
@@ -460,8 +460,7 @@ def gains_of_file(config: Config, settings: LoopSettings) -> ChosenGains:
         raise ConfigurationError(f"{config.path}: gains are chosen for control.kind (={kind}) of {known} only")
     if kind in OBSERVING_LAWS:
         settings = replace(settings, observer_delay_cycles=_observed_late(settings.delay_s + settings.lag_s, config))
-    friction_Nm = 0.0 if config.reducer is not None else static_friction_Nm(config) or 0.0
-    believed = replace(BELIEVED, friction_radps2=friction_Nm / config.joint.inertia_kgm2)
+    believed = replace(BELIEVED, friction_radps2=(static_friction_Nm(config) or 0.0) / config.joint.inertia_kgm2)
     return _chosen(config, law, believed, settings, "tracking")
 
 

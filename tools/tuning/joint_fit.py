@@ -115,10 +115,11 @@ class JointFit:
         def share(name: str) -> float:
             return self.values[name].half / self.values[name].value
 
+        known = Intervals(share("inertia_kgm2"), self.late_s.half, friction_radps2=self.friction_radps2)
         if not self.flexible:
-            return Intervals(share("inertia_kgm2"), self.late_s.half, friction_radps2=self.friction_radps2)
+            return known
         stiffness = share("stiffness_Nmprad") if self.tells_link else 2.0 * share("resonance_Hz")
-        return Intervals(share("inertia_kgm2"), self.late_s.half, stiffness, share("link_kgm2"), self.tells_link)
+        return replace(known, stiffness=stiffness, link=share("link_kgm2"), tells_link=self.tells_link)
 
     def beside_friction(self, break_away_Nm: float) -> JointFit:
         """Wider intervals where the friction is much for the inertia: where it slides it looks like a part of it."""
