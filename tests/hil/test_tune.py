@@ -22,6 +22,7 @@ from jointctl.drivers.errors import (
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
+from jointctl.tools.configuration.config import ConfigurationProblems
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
@@ -139,6 +140,30 @@ def test_a_response_alone_of_a_light_joint_has_the_law_of_a_tune(
     found = json.loads(out.getvalue())["fit"]["values"]["inertia_kgm2"]
     assert found["value"] == pytest.approx(0.3, abs=found["half"])
     assert found["half"] < 0.1
+
+
+def test_a_motor_that_weighs_more_by_its_file_than_the_whole_joint_is_found_all_the_same(tmp_path: Path) -> None:
+    """0.84 kg m^2, of which 0.3 are the motor's; by the file they are 2.1 and 0.95."""
+    wrong = {"virtual__inertia_scale": 0.4, "virtual__motor_side_inertia_kgm2": 0.3}
+    path = written(tmp_path / "soft.toml", "realistic", **wrong)
+    output, *_ = outputs()
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True)) == 0
+    found = load_config(path)
+    assert found.joint.inertia_kgm2 == pytest.approx(0.84, rel=0.05)
+    assert found.reducer is not None
+    assert found.reducer.motor_inertia_kgm2 == pytest.approx(0.3, rel=0.1)
+
+
+def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def problems(_: Tune) -> None:
+        raise ConfigurationProblems(["one", "other"])
+
+    monkeypatch.setattr(Tune, "_step_direction", problems)
+    path = written(tmp_path / "joint.toml", "precise")
+    output, *_ = outputs()
+    with pytest.raises(ConfigurationProblems) as raised:
+        tune(load_config(path), output, options=TuneOptions(lockstep=True))
+    assert str(raised.value).startswith(f"direction: one\nother; {path} is as it was")
 
 
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:

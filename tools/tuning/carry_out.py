@@ -210,6 +210,7 @@ HUNTING_Hz = 8.0  # between sticking and sliding, below it; a resonance swings a
 PUSHED_s = 0.5  # before the end, in which no torque was more
 STANDS_SHARE = 0.1  # of the way of the reference: what the other encoder may show of a joint that stands
 TOO_WEAK = "the law may be too weak for the friction where joint.inertia_kgm2 (={:g}) is too small"
+MOST_OF_MOTOR = 0.95  # of the whole inertia
 RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
 LEAST_CHANGE = 0.1  # of the inertia: a payload; what both intervals allow is none
 
@@ -372,7 +373,12 @@ def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
 
 
 def _with_inertia(config: Config, inertia_kgm2: float) -> Config:
-    return with_values(config, [Found(("joint",), "inertia_kgm2", rounded(inertia_kgm2), "")])
+    """A motor that would weigh more than all of it, by its file, keeps its share."""
+    values, reducer = [Found(("joint",), "inertia_kgm2", rounded(inertia_kgm2), "")], config.reducer
+    if reducer is not None and reducer.motor_inertia_kgm2 > MOST_OF_MOTOR * inertia_kgm2:
+        motor_kgm2 = reducer.motor_inertia_kgm2 * inertia_kgm2 / config.joint.inertia_kgm2
+        values.append(Found(("reducer",), "motor_inertia_kgm2", rounded(motor_kgm2), ""))
+    return with_values(config, values)
 
 
 def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:

@@ -25,6 +25,7 @@ from jointctl.drivers.errors import (
     MotionFault,
     TooFewPoints,
     UsageError,
+    one_line,
 )
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -195,7 +196,8 @@ class Tune:
             except JointctlError as error:
                 kept = f"{self.original.path} is as it was, {self.folder} has the steps before"
                 seen = error.message.removeprefix(f"{name}: ")
-                raise type(error)(f"{name}: {seen}; {kept}", error.hint) from None
+                error.message = f"{name}: {seen}; {one_line(kept)}"
+                raise
         if self.options.refine:
             self._refine()
 
