@@ -232,7 +232,7 @@ def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw
     if law is not None:
         keys |= {
             "kind": "computed_torque_observer", "kp": law.kp_ps2, "kv": law.kv_ps, "observer_radps": law.observer_radps,
-            "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True,
+            "ki": 0.0, "integral_limit_rads": 0.0, "filtered_error_rate": True, "observer_paired": False,
         }  # fmt: skip
         if config.encoder.side == "joint":
             own_Hz = config.control.velocity_cutoff_Hz or law.link_cutoff_Hz

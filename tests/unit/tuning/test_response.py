@@ -357,6 +357,8 @@ def test_before_the_friction_is_known_the_reading_is_watched_by_what_moved_the_j
     moving = config_of_response(config, None)
     assert moving.control.feed_forward == "none"
     assert config_of_response(shipped("precise"), None).control.feed_forward == "desired"
+    paired = shipped("precise", control__observer_paired=True)  # as the law of a tune is that chooses gains
+    assert not config_of_response(paired, None).control.observer_paired
     assert axis_constants(without_friction(config), np.zeros((2, 5)))[0].limits.frozen_torque_Nm == 0.0
 
 
