@@ -42,9 +42,11 @@ SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND
 # A drive that was commanded to stop and does not report that it does so, or reports nothing, does not receive us (SYNC
 # or RPDO lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
-# The last report may be wrong, or older than the enabling that it has carried out: only one that says "off" counts, and
-# after a quick stop "braking" as well.
+# One report may be damaged, or older than the enabling that the drive has carried out.  Two alike count that say "off"
+# or "in fault", after a quick stop "braking" as well.  Others without torque, such as of a drive that waits for its
+# brake to close, count as long as they come.
 IGNORED_MAX_CYCLES = 20
+STILL_REPORTS_CYCLES = 2
 # an error code stays for so long although the drive has reset it: it may be why the joint stops
 ERROR_SHOWN_CYCLES = 20
 _MOST_COUNTS = 2.0**62
@@ -130,6 +132,8 @@ class CanopenPort:
     counts: i8  # unwrapped
     cycle: i8
     state: i4  # cia.State
+    repeated: i4  # 1: the last two reports were of this state, or a boot-up was
+    heard_cycle: i8  # of the last report
     nmt_state: i4
     wake_ns: i8  # when the last cycle began
     stale: i4  # 1: what waits before SYNC answers one that is too long ago
@@ -303,7 +307,9 @@ def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
     if port.in_cycle != 0:
         port.answered |= SEEN_FIRST
     sample.status_word = get_u16(frame.payload, port.status_at)
-    port.state = decode_state(sample.status_word)
+    state = decode_state(sample.status_word)
+    port.repeated = 1 if state == port.state else 0
+    port.state, port.heard_cycle = state, port.cycle
     sample.drive_state = drive_state(port.state)
     take_counts(port, get_i32(frame.payload, port.position_at))
     port.first_rad = (port.counts - port.zero_counts) * port.position_radpcount
@@ -359,8 +365,9 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
             port.heartbeat_heard_cycle = port.cycle
             if port.nmt_state == NmtState.BOOT_UP:
                 sample.restarts += 1
-                # a drive that has just booted has no power (CiA 402-2), and sends no TPDO that would say so
-                port.state = State.SWITCH_ON_DISABLED
+                # a drive that has just booted has no power (CiA 402-2), and sends no TPDO that would say so; one whose
+                # communication alone was reset stops as 6007 says
+                port.state, port.repeated = State.SWITCH_ON_DISABLED, 1
                 sample.drive_state = drive_state(port.state)
     return False
 
@@ -425,15 +432,19 @@ def _put_velocity_offset(port: CanopenPort, frame: Frame, command: Command, enab
 
 @kernel
 def _ignores(port: CanopenPort, request: int) -> bool:
-    """Whether the drive's last report is not that of one that stops as it is asked to."""
+    """Whether the drive's last reports are not those of one that stops as it is asked to."""
     state = port.state
     if request == DriveRequest.ENABLE:
         return False
     if request == DriveRequest.PREPARE or port.asked == 0:
         return state == State.OPERATION_ENABLED
+    if port.repeated == 0 or state == State.OPERATION_ENABLED:
+        return True
     if state == State.QUICK_STOP_ACTIVE:
         return request == DriveRequest.OFF
-    return state != State.SWITCH_ON_DISABLED and state != State.FAULT and state != State.FAULT_REACTION_ACTIVE
+    if state == State.SWITCH_ON_DISABLED or state == State.FAULT or state == State.FAULT_REACTION_ACTIVE:
+        return False
+    return port.cycle - port.heard_cycle > STILL_REPORTS_CYCLES
 
 
 @kernel

@@ -76,12 +76,17 @@ def test_the_second_fault_of_a_pair_comes_as_often_in_the_cycle_as_in_the_stop()
 
 
 def test_a_damaged_report_is_not_that_of_a_drive_that_stops(config: Config, lockstep: LockstepJoint) -> None:
-    """The drive got no SYNC after it: it held its last torque for 5.1 s, until the heartbeat ended with the loop."""
-    verdict = judge(config, lockstep, draw_scenario(16, 1862, pairs=True))
-    assert (verdict.kind, verdict.then) == ("tpdo_corrupted", "sync_lost 1.6 ms later")
-    assert (verdict.fault, verdict.violations) == ("POSITION_JUMP", ())
-    assert verdict.off_s is not None
-    assert verdict.off_s < 0.25
+    """The drive got no SYNC after it: it held its last torque for 5.1 s, until the heartbeat ended with the loop.
+
+    Whatever the report says: the numbers draw its bytes.
+    """
+    scenario = draw_scenario(16, 1862, pairs=True)
+    for number in (1862, *range(13, 1400, 33)):
+        verdict = judge(config, lockstep, dataclasses.replace(scenario, number=number))
+        assert (verdict.kind, verdict.then) == ("tpdo_corrupted", "sync_lost 1.6 ms later")
+        assert verdict.violations == (), number
+        assert verdict.off_s is not None
+        assert verdict.off_s < 0.3
 
 
 def test_a_jump_behind_a_reading_that_stands_still_need_not_be_noticed(config: Config, lockstep: LockstepJoint) -> None:

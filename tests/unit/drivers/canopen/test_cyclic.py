@@ -30,6 +30,7 @@ from jointctl.drivers.canopen.cyclic import (
     SCRATCH_WORDS,
     SLOT_RECEIVED,
     SLOT_RPDO,
+    STILL_REPORTS_CYCLES,
     CanopenPort,
     accept_frame,
     answer_owed,
@@ -137,6 +138,7 @@ def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: i
     assert begin_cycle(enabled.port, enabled.frames) == frames
     # a drive that obeys in the end: within the limit all is forgotten, beyond it its watchdog stays without a heartbeat
     enabled.tpdo(STATUSWORDS[State.SWITCH_ON_DISABLED])
+    enabled.port.repeated = 1
     enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
     assert enabled.port.ignored_cycles == (0 if frames == 2 else cycles)
     assert begin_cycle(enabled.port, enabled.frames) == frames
@@ -153,19 +155,41 @@ OBEYS = {
 @pytest.mark.parametrize("state", State)
 @pytest.mark.parametrize("request_", OBEYS)
 @pytest.mark.parametrize("asked", [DriveRequest.ENABLE, DriveRequest.PREPARE, None])
-def test_only_a_report_of_stopping_shows_that_the_drive_stops(
+def test_only_reports_of_stopping_show_that_the_drive_stops(
     wire: Wire, state: State, request_: DriveRequest, asked: DriveRequest | None
 ) -> None:
-    """Its last report may be a damaged one, or of before it was enabled; one that was never asked need not obey."""
+    """One report may be damaged, or of before it was enabled; a drive that was never asked need not obey."""
     if asked is not None:
         wire.rpdo(0.0, asked)
-    wire.tpdo(STATUSWORDS.get(state, 0x0001))
-    wire.rpdo(0.0, request_)
-    ignored = state is State.OPERATION_ENABLED if asked is None else state not in OBEYS[request_]
-    assert wire.port.ignored_cycles == ignored
+    wire.port.state = State.SWITCHED_ON if state is not State.SWITCHED_ON else State.FAULT
+    enabled = state is State.OPERATION_ENABLED
+    moving = enabled or (state is State.QUICK_STOP_ACTIVE and request_ is DriveRequest.OFF)
+    for ignored in (asked is not None, asked is not None and moving):  # once, and once more
+        begin_cycle(wire.port, wire.frames)
+        wire.tpdo(STATUSWORDS.get(state, 0x0001))
+        wire.port.ignored_cycles = 0
+        wire.rpdo(0.0, request_)
+        assert wire.port.ignored_cycles == (ignored or enabled)
+    silent_for = 0  # until the report counts no more
+    while wire.port.ignored_cycles == 0 and silent_for < 100:
+        begin_cycle(wire.port, wire.frames)
+        wire.rpdo(0.0, request_)
+        silent_for += 1
+    lasts = 100 if asked is None or state in OBEYS[request_] else STILL_REPORTS_CYCLES + 1
+    assert silent_for == (0 if ignored or enabled else lasts)
     wire.port.ignored_cycles = 0
     wire.rpdo(0.0, DriveRequest.PREPARE)
-    assert wire.port.ignored_cycles == (state is State.OPERATION_ENABLED)
+    assert wire.port.ignored_cycles == enabled
+
+
+@pytest.mark.parametrize("state", [State.READY_TO_SWITCH_ON, State.SWITCHED_ON])
+def test_a_drive_that_waits_for_its_brake_keeps_the_heartbeat(enabled: Wire, state: State) -> None:
+    """It reports "switched on" until the brake has closed: a normal stop ended as OFF_TIMEOUT."""
+    for _ in range(10 * IGNORED_MAX_CYCLES):
+        begin_cycle(enabled.port, enabled.frames)
+        enabled.tpdo(STATUSWORDS[state])
+        enabled.rpdo(0.0, DriveRequest.OFF)
+    assert enabled.port.ignored_cycles == 0
 
 
 @pytest.mark.parametrize(
