@@ -431,8 +431,7 @@ class LimitConstants:
     saturation_max_cycles: i8
     skipped_max_cycles: i8  # in one overrun
     standstill_radps: f8
-    # a second encoder of the joint; 0 = there is none
-    disagreement_max_rad: f8
+    disagreement_max_rad: f8  # of the joint's two encoders; 0 = there is only one
     twist_radpNm: f8  # by how much they may differ more for each Nm of torque: the reducer's compliance
     limit_source: i4  # LimitSource
     swing: SwingConstants
@@ -494,6 +493,7 @@ class Sample:
     drive_error: i4  # the drive's own error code, 0 = none
     encoder_error: i4  # the same of an encoder node; ENCODER_RESTARTED: it has lost its count
     restarts: i4  # boot-ups of the drive seen since it was commissioned
+    sends_none: i4  # 1: by the drive's last word it has left the state in which it takes commands and sends samples
     bus_errors: i4  # sends that failed in a row; LINE_GONE where nothing will ever be heard or said again
     heartbeat_age_cycles: i4  # since the drive's own last heartbeat; 0 where it sends none
     sync_late_ns: i4  # how long after the first bus of an arm this drive's bus got its SYNC

@@ -221,7 +221,8 @@ def released_torque_Nm(constants: AxisConstants, state: AxisState, elapsed_cycle
 def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
     """QUICK_STOPPING and DISABLING end when the drive says that its power stage is off, or when it never does.
 
-    Without a line there is nothing to wait for: the supervisor shall tell the user at once.
+    Without a line there is nothing to wait for: the supervisor shall tell the user at once.  The same holds of
+    a drive that has announced that it sends no samples: whether it is off, the supervisor reads.
     """
     if sample.bus_errors >= LINE_GONE and state.phase >= AxisPhase.QUICK_STOPPING:
         enter(state, AxisPhase.FINISHED)
@@ -229,16 +230,20 @@ def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) ->
     reads_off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
     answers = state.sample_age_cycles == 0 or sample.restarts != 0  # after its boot-up a drive sends no samples
     off = reads_off and answers and state.phase_cycle > ANSWER_CYCLES
+    unheard = sample.sends_none != 0 and state.sample_age_cycles > ANSWER_CYCLES and state.phase_cycle > ANSWER_CYCLES
     if state.phase == AxisPhase.QUICK_STOPPING:
         if off:
             enter(state, AxisPhase.DISABLING)
             state.ready = 1  # it has answered: `jointctl stop` may take the node out of operational now
+        elif unheard:
+            trip(state, Fault.OFF_TIMEOUT, float(sample.status_word), sample.drive_error)
+            enter(state, AxisPhase.FINISHED)
         elif state.phase_cycle > constants.sequence.stop_max_cycles:
             react(state, Reaction.OFF)
     elif state.phase == AxisPhase.DISABLING:
         if off or (reads_off and state.ready != 0):
             enter(state, AxisPhase.FINISHED)
-        elif waited_too_long(state, constants.sequence.off_max_cycles):
+        elif unheard or waited_too_long(state, constants.sequence.off_max_cycles):
             trip(state, Fault.OFF_TIMEOUT, float(sample.status_word), sample.drive_error)
             enter(state, AxisPhase.FINISHED)
 

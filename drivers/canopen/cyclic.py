@@ -319,6 +319,7 @@ def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
         port.error_reset = 0
         sample.drive_error = 0
     port.seen |= SEEN_FIRST
+    sample.sends_none = 0  # a TPDO is sent in operational only
     return publish_sample(port, sample, now_ns)
 
 
@@ -363,6 +364,8 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
         if frame.length >= 1:
             port.nmt_state = frame.payload[0] & 0x7F
             port.heartbeat_heard_cycle = port.cycle
+            left = port.nmt_state == NmtState.STOPPED or port.nmt_state == NmtState.PRE_OPERATIONAL
+            sample.sends_none = 1 if left else 0
             if port.nmt_state == NmtState.BOOT_UP:
                 sample.restarts += 1
                 # a drive that has just booted has no power (CiA 402-2), and sends no TPDO that would say so; one whose

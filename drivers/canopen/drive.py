@@ -110,7 +110,9 @@ class CanopenDrive:
         self._node.sdo.RESPONSE_TIMEOUT = sdo_timeout_s
         self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
         self._objects.gate = gate
-        self._switch_off = SwitchOff(self._network, settings.node, self._objects, encoder, sleep)
+        self._switch_off = SwitchOff(
+            self._network, settings.node, self._objects, encoder, sleep, settings.stop_timeout_s
+        )
 
     def _pause(self, seconds: float) -> None:
         """Sleep, and leave as soon as the user has asked for a stop."""

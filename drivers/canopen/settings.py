@@ -89,4 +89,5 @@ class CanopenSettings:
     following_error_max_rad: float = 0.0  # at the joint, for the drive's own window in CSP
     holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any
+    stop_timeout_s: float = 0.0  # how long the drive may brake by itself until its power is taken
     torque_limit: TorqueLimitObject | None = None  # where the drive has no 6072, or beside it

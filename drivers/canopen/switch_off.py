@@ -40,11 +40,12 @@ def state_of(objects: ObjectAccess) -> State:
     return state_of_word(objects.read(0x6041, what="statusword"))
 
 
-def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> None:
-    """If the drive is powered, its quick stop, until it is off or QUICK_STOP_S is over."""
-    for attempt in range(round(QUICK_STOP_S / POLL_S)):
+def brake(objects: ObjectAccess, sleep: Callable[[float], None], longest_s: float = QUICK_STOP_S) -> None:
+    """If the drive is powered, its quick stop, until it is off or QUICK_STOP_S is over, `longest_s` if it brakes."""
+    for attempt in range(round(max(longest_s, QUICK_STOP_S) / POLL_S)):
         state = state_of(objects)
-        if state not in POWERED_STATES:
+        obeys = state in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+        if not obeys and (state is not State.OPERATION_ENABLED or attempt >= round(QUICK_STOP_S / POLL_S)):
             return
         if attempt == 0 and state is State.OPERATION_ENABLED:
             objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
@@ -59,8 +60,10 @@ class SwitchOff:
 
     def __init__(
         self, network: canopen.Network, node: int, objects: ObjectAccess, encoder_node: int | None,
-        sleep: Callable[[float], None],
+        sleep: Callable[[float], None], braking_s: float = QUICK_STOP_S,
     ) -> None:  # fmt: skip
+        """`braking_s`: how long a drive that brakes already may go on; its power is taken then."""
+        self._braking_s = braking_s
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
@@ -120,7 +123,7 @@ class SwitchOff:
     def _attempt(self) -> str:
         self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
         self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
-        brake(self._objects, self._sleep)
+        brake(self._objects, self._sleep, self._braking_s)
         for _ in range(round(OFF_S / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
             state = state_of(self._objects)

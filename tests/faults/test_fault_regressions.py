@@ -82,6 +82,23 @@ def powered_s(run: LockstepRun) -> float:
     )
 
 
+@pytest.mark.parametrize("kind", [FaultKind.SYNC_LOST, FaultKind.CONTROLLER_HEARTBEAT_LOST])
+def test_the_loop_does_not_wait_for_a_drive_whose_watchdog_has_stopped_it(
+    lockstep: LockstepJoint, kind: FaultKind
+) -> None:
+    """A stopped node sends no TPDO: the loop waited for stop_timeout_s and off_timeout_s, 5 s, until it was read."""
+    run = lockstep.run_with_faults(one_fault(kind, AT_s))
+    assert run.fault is Fault.STALE_SAMPLE
+    assert run.state.phase == AxisPhase.FINISHED
+    tripped = int(np.argmax(run.log.fault != Fault.NONE))
+    assert (len(run.log) - tripped) * 1e-3 <= IGNORED_MAX_CYCLES * 1e-3 + 2.0 * HEARTBEAT_s + 0.01
+    silent = faults_of((kind, AT_s, 60.0, 1.0), (FaultKind.DRIVE_HEARTBEAT_LOST, AT_s, 60.0, 1.0))
+    twin = lockstep.run_with_faults(silent)  # whether it is operational is not known: its word is awaited
+    assert twin.fault is Fault.STALE_SAMPLE
+    tripped = int(np.argmax(twin.log.fault != Fault.NONE))
+    assert (len(twin.log) - tripped) * 1e-3 >= 2.0
+
+
 @pytest.mark.parametrize("at_s", [0.0545, 0.055, 0.06])
 def test_a_drive_that_is_lost_in_the_moment_of_enabling_is_stopped_by_its_watchdog(
     lockstep: LockstepJoint, at_s: float

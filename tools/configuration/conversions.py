@@ -24,10 +24,10 @@ def shared(settings: type[Any], *sections: Section) -> dict[str, Any]:
 
 
 def joint_settings(settings: type[Any], config: Config, drive: Section) -> dict[str, Any]:
-    """What the settings of every driver take from [drive], [limits], [loop], [joint] and [encoder]."""
+    """What the settings of every driver take from [drive], [limits], [sequence], [loop], [joint] and [encoder]."""
     encoder = config.encoder
     return {
-        **shared(settings, drive, config.limits, config.loop, config.joint, encoder),
+        **shared(settings, drive, config.limits, config.sequence, config.loop, config.joint, encoder),
         "torque_constant_NmpA": torque_constant_NmpA(config),
         "encoder_on_motor": encoder.side == "motor",
         "encoder_direction": encoder.direction,

@@ -173,7 +173,8 @@ class Control:
 def stop_within_s(config: Config) -> float:
     """How long the program may take to end after `jointctl stop`: quick stop, switching off, read back, files."""
     sequence = config.sequence
-    return sequence.stop_timeout_s + sequence.off_timeout_s + QUICK_STOP_S + OFF_S + FILES_S
+    braking_s = max(QUICK_STOP_S, sequence.stop_timeout_s)  # once more, of a drive that the loop does not reach
+    return sequence.stop_timeout_s + sequence.off_timeout_s + braking_s + OFF_S + FILES_S
 
 
 @contextmanager

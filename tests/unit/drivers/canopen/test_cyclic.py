@@ -371,6 +371,19 @@ def test_a_boot_up_is_a_restart_and_a_heartbeat_is_not(wire: Wire) -> None:
     assert wire.sample.restarts == 2
 
 
+def test_a_heartbeat_out_of_operational_announces_that_no_samples_come_and_a_sample_refutes_it(wire: Wire) -> None:
+    for data, sends_none in (("05", 0), ("04", 1), ("05", 0), ("7f", 1), ("ff", 1), ("", 1), ("00", 0), ("84", 1)):
+        wire.receive(0x705, bytes.fromhex(data))
+        assert wire.sample.sends_none == sends_none
+    wire.receive(0x706, b"\x05")
+    assert wire.sample.sends_none == 1
+    begin_cycle(wire.port, wire.frames)
+    wire.receive(0x185, b"\x37")  # too short: none
+    assert wire.sample.sends_none == 1
+    wire.receive(0x185, b"\x37\x02\0\0\0\0\0\0")
+    assert wire.sample.sends_none == 0
+
+
 def test_a_drive_that_has_booted_is_off_until_it_reports_otherwise(wire: Wire) -> None:
     """Its last TPDO said "enabled": it was taken for a drive that ignores its stop, and the heartbeat was withheld."""
     for reported, data in ((DriveState.ENABLED, None), (DriveState.OFF, b"\x00"), (DriveState.ENABLED, None)):

@@ -171,6 +171,22 @@ def test_the_quick_stop_is_asked_for_once_and_waited_for(states: list[State], lo
 
 
 @pytest.mark.parametrize(
+    ("state", "longest_s", "polls"),
+    [
+        (BRAKING, 3.0, 150), (BRAKING, 0.5, 50), (ON, 3.0, 50), (SWITCHED, 3.0, 0),
+        (State.FAULT_REACTION_ACTIVE, 3.0, 150), (State.FAULT, 3.0, 0),
+    ],
+)  # fmt: skip
+def test_a_drive_that_brakes_may_take_longer_than_one_that_does_not_obey(
+    state: State, longest_s: float, polls: int
+) -> None:
+    """The loop ends before the drive's own quick stop where the node has left operational: it is not cut short."""
+    drive: Any = DriveInMemory(state)
+    brake(drive, drive.wait, longest_s)
+    assert [entry for entry in drive.log if entry != QUICK_STOP] == [POLL_S] * polls
+
+
+@pytest.mark.parametrize(
     ("states", "deaf_to", "state", "log"),
     [
         ([OFF], b"", "switch on disabled", [NO_VOLTAGE, *NO_TARGETS]),

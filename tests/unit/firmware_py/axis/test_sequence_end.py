@@ -118,10 +118,37 @@ def test_on_a_line_that_is_gone_there_is_nothing_to_wait_for(
     assert state.phase == (AxisPhase.FINISHED if bus_errors == LINE_GONE else phase)
 
 
+@pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING])
+@pytest.mark.parametrize("drive_state", [DriveState.ENABLED, DriveState.STOPPING, DriveState.OFF])
+@pytest.mark.parametrize(
+    ("sends_none", "age_cycles", "phase_cycle", "ends"),
+    [
+        (1, ANSWER_CYCLES + 1, ANSWER_CYCLES + 1, True),
+        (0, ANSWER_CYCLES + 1, ANSWER_CYCLES + 1, False),
+        (1, ANSWER_CYCLES, ANSWER_CYCLES + 1, False),
+        (1, ANSWER_CYCLES + 1, ANSWER_CYCLES, False),
+    ],
+)
+@pytest.mark.parametrize("first", [Fault.STALE_SAMPLE, Fault.NONE])
+def test_behind_a_drive_that_sends_none_there_is_nothing_to_wait_for(
+    axis: Any, state: Any, phase: AxisPhase, drive_state: DriveState, sends_none: int, age_cycles: int,
+    phase_cycle: int, ends: bool, first: Fault,
+) -> None:  # fmt: skip
+    """That it is off was not heard, whatever its last sample says; the first cause stays."""
+    state.phase, state.fault, state.phase_cycle, state.sample_age_cycles = phase, first, phase_cycle, age_cycles
+    sample = sample_of(drive_state)
+    sample.sends_none = sends_none
+    step_stopping(axis, state, sample)
+    assert state.phase == (AxisPhase.FINISHED if ends else phase)
+    assert state.fault == (first or (Fault.OFF_TIMEOUT if ends else Fault.NONE))
+
+
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p not in (AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)])
 def test_the_stop_concerns_no_other_phase(axis: Any, state: Any, phase: AxisPhase) -> None:
-    state.phase, state.phase_cycle = phase, 1000
-    step_stopping(axis, state, sample_of(DriveState.OFF))
+    state.phase, state.phase_cycle, state.sample_age_cycles = phase, 1000, 1000
+    sample = sample_of(DriveState.OFF)
+    sample.sends_none = 1
+    step_stopping(axis, state, sample)
     assert state.phase == phase
 
 
