@@ -133,7 +133,8 @@ class Cia402Device:
         self.faults: np.ndarray = np.zeros(0) if faults is None else faults
         self.queue = new(FrameQueue)
         self._frame = np.zeros(FRAME_SIZE, np.uint8)
-        self.objects = ObjectDictionary(eds_path, settings.node_id, self.device, settings.shown)
+        counts_per_turn = math.tau * abs(float(self.plant_constants[0].counts_prad))
+        self.objects = ObjectDictionary(eds_path, settings.node_id, self.device, settings.shown, counts_per_turn)
         self._configure()
         self.parameters = ParameterStore(self.objects, settings.parameter_file)
         self.objects.restore_strings()

@@ -160,6 +160,11 @@ def field_view(memory: np.recarray, path: tuple[str, ...], field: str) -> np.nda
     return np.ndarray((1,), dtype, buffer=bytes_of_memory, offset=offset + element * dtype.itemsize)
 
 
+EDS_COUNTS_PER_TURN = 2.0**19  # of the joint, for which the EDS has its speeds and ramps
+LARGEST_UNSIGNED = 0xFFFFFFFF
+_IN_COUNTS = frozenset(((0x6081, 0), (0x6083, 0), (0x6084, 0), (0x6085, 0), (0x6099, 1), (0x6099, 2), (0x609A, 0)))
+
+
 class ObjectDictionary:
     """Values of all objects of one device; `memory` is its `Device` record array of one element.
 
@@ -169,10 +174,20 @@ class ObjectDictionary:
     """
 
     def __init__(
-        self, eds_path: Path, node_id: int, memory: np.recarray, shown: canopen.ObjectDictionary | None = None
+        self,
+        eds_path: Path,
+        node_id: int,
+        memory: np.recarray,
+        shown: canopen.ObjectDictionary | None = None,
+        counts_per_turn: float = EDS_COUNTS_PER_TURN,
     ) -> None:
+        """`counts_per_turn` of the joint: speeds and ramps begin with those of the EDS, whatever the encoder."""
         self._memory = memory
-        self._take_entries(load_entries(eds_path, node_id))
+        entries = load_entries(eds_path, node_id)
+        for key in _IN_COUNTS.intersection(entries):
+            scaled = round(int(entries[key].default) * counts_per_turn / EDS_COUNTS_PER_TURN)
+            entries[key] = replace(entries[key], default=min(max(scaled, 1), LARGEST_UNSIGNED))
+        self._take_entries(entries)
         for key, field in FIELDS.items():
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the drive uses it")

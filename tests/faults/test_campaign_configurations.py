@@ -138,12 +138,19 @@ def test_no_scenario_violates_an_invariant_in_the_steps_of_a_tune(tuned: tuple[C
 
 
 def test_no_scenario_violates_an_invariant_in_the_steps_of_a_soft_joint() -> None:
-    """Two encoders; a quick stop along 6085 that is slower than friction alone: scenario 24 of seed 880612 with it."""
+    """Two encoders; scenario 24 of seed 880612 also with a quick stop along 6085 that is slower than friction alone."""
     soft = campaign_joint(load_config(CONFIGS / "realistic.toml"), "tune")
     drawn = [draw_scenario(880611, number, "tune") for number in range(KINDS)]
     found = [judge(*soft, one, placed_step) for one in (*drawn, draw_scenario(880612, 24, "tune"))]
     assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
     assert {v.fault for v in found} >= {"POSITION_DISAGREEMENT", "VELOCITY_LIMIT"}
+    assert soft[1].quick_stop_radps2 == pytest.approx(11.98, abs=0.01)
+    soft[1]._virtual.device[0].drive.quick_stop_deceleration = 1_000_000  # counts of the motor: 0.8 rad/s2
+    slow = judge(*soft, draw_scenario(880612, 24, "tune"), placed_step)
+    assert (soft[1].quick_stop_radps2 < 0.8, slow.violations) == (True, ())
+    assert slow.off_s is not None
+    assert found[-1].off_s is not None
+    assert slow.off_s > found[-1].off_s
 
 
 def test_behind_a_stuck_encoder_no_step_of_a_tune_runs_away(tuned: tuple[Config, LockstepJoint]) -> None:

@@ -235,7 +235,7 @@ def run_arm_scenario(joints: LockstepArm, scenario: ArmScenario) -> tuple[list[L
 
 
 def _tail_s(joints: LockstepArm) -> float:
-    """For how long it is watched: a drive that is left alone brakes along 6085, on soft joints slowly."""
+    """For how long it is watched: a drive that is left alone brakes along 6085, however slow that is."""
     speeds = [config.limits.velocity_max_radps for config in joints.arm.joints]
     return TAIL_s + LEFT_ALONE_SPEEDS * float((speeds / joints.quick_stop_radps2).max())
 

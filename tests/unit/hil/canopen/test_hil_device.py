@@ -12,6 +12,8 @@ import pytest
 
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.realtime_device import SEND_ERRORS_WORD, RealtimeDevice
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.virtual_joint import new_device
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network, Rig, frame, network_node, virtual_drive
 
@@ -228,3 +230,13 @@ def test_real_time_device_boots_answers_and_stops() -> None:
         ours.send(frame(0, b"\x81\x05"))
         assert ours.recv(16) == frame(0x705, b"\x00")
     assert running.words[SEND_ERRORS_WORD] == 0
+
+
+@pytest.mark.parametrize("name", ["virtual", "realistic", "arm/wrist"])
+def test_its_ramps_are_the_same_at_the_joint_whatever_encoder_the_drive_counts(name: str) -> None:
+    """6085 of the soft joints, whose drives count the motor's encoder, was 0.8 rad/s2 at the joint."""
+    device = new_device(load_config(shipped_config(name)))
+    drive = device.device[0].drive
+    counts_prad = abs(float(device.device[0].counts_per_rad))
+    assert int(drive.quick_stop_deceleration) / counts_prad == pytest.approx(11.98, abs=0.01)
+    assert int(drive.profile_deceleration) / counts_prad == pytest.approx(4.79, abs=0.01)
