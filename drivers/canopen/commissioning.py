@@ -30,7 +30,7 @@ from jointctl.drivers.canopen.pdo import (
 from jointctl.drivers.canopen.sdo import ObjectAccess, object_name
 from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
-from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline
+from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline, quick_stop_of
 from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.errors import DeviceError
 from jointctl.firmware_py.states import in_words
@@ -435,6 +435,15 @@ def counts_per_motor_turn(objects: ObjectAccess) -> float:
     return increments / turns if turns else 0.0
 
 
+def _unsigned(objects: ObjectAccess, index: int, sub: int) -> int | None:
+    """None also where the drive refuses to give it."""
+    try:
+        value = objects.read_if_present(index, sub, what="unit or ramp of the quick stop")
+    except DeviceError:
+        return None
+    return None if value is None else value & 0xFFFFFFFF
+
+
 def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """The drive watches our heartbeat and stops by itself when it stays away; it sends its own as well."""
     milliseconds = round(settings.heartbeat_s * 1000.0)
@@ -455,7 +464,9 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     if not findings.heartbeat_watched:
         findings.remarks.append("no object 1017: a restarted drive is noticed by its boot-up message and its silence")
     findings.settings["on a lost heartbeat"], remarks = arm_reaction(objects, settings)
-    findings.remarks += remarks
+    quick_stop = quick_stop_of(lambda *place: _unsigned(objects, *place), settings)
+    findings.settings["quick stop"] = quick_stop.words
+    findings.remarks += [*remarks, *filter(None, [quick_stop.problem(settings)])]
     findings.settings["watchdog"] = f"{milliseconds} ms on the heartbeat of node {settings.master_node}"
 
 

@@ -82,7 +82,7 @@ class CanopenSettings:
     joint_encoder: JointEncoderSettings | None = None
     encoder_incremental: bool = False
     sdo_timeout_s: float | None = None  # of one SDO request; None: `switch_off.SDO_TIMEOUT_S`
-    velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes
+    velocity_max_radps: float | None = None  # at the joint, also for the drive's own limit in the velocity modes
     torque_offset: bool = False  # 60B2 beside the target of a drive that closes its own loop
     velocity_offset: bool = False  # 60B1 beside 607A
     velocity_share: float = 1.0  # of the target's velocity that goes into 60B1
@@ -90,4 +90,7 @@ class CanopenSettings:
     holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any
     stop_timeout_s: float = 0.0  # how long the drive may brake by itself until its power is taken
+    brake_radps2: float = 0.0  # at the joint, of the loop's controlled stop; the drive's own is compared with it
+    position_min_rad: float = -math.inf
+    position_max_rad: float = math.inf
     torque_limit: TorqueLimitObject | None = None  # where the drive has no 6072, or beside it

@@ -13,13 +13,23 @@ a second as long as the loop runs, which costs four SDO uploads.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import canopen
 
 from jointctl.drivers.canopen.cia import EMERGENCY_ID, HEARTBEAT_ID, NmtState
-from jointctl.drivers.canopen.pdo import COMMUNICATION_RPDO, DISABLED, EVENT_TIMER, IDENTIFIER, LAST_PDO, pdos_of
+from jointctl.drivers.canopen.pdo import (
+    COMMUNICATION_RPDO,
+    DISABLED,
+    EVENT_TIMER,
+    IDENTIFIER,
+    LAST_PDO,
+    joint_angle_per_count_rad,
+    pdos_of,
+)
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import DeviceError
@@ -62,6 +72,105 @@ def arm_reaction(objects: ObjectAccess, settings: CanopenSettings) -> tuple[str,
             "up to the drive"
         ]
     return "6007 = 3 (quick stop)" + (", 1029:1 = 2 (stopped)" if leaves else "") + ", read back", []
+
+
+# --- how fast its quick stop brakes ---
+
+QUICK_STOP_RAMPS = {1: 0x6084, 2: 0x6085, 5: 0x6084, 6: 0x6085}  # of 605A
+_OTHER_REACTIONS = {
+    0: "takes its power at once: the joint coasts",
+    **dict.fromkeys((3, 7), "brakes at its current limit: how fast is not known"),
+    **dict.fromkeys((4, 8), "brakes at its voltage limit: how fast is not known"),
+}
+_OWN_UNITS = {0xFB: "maxon", 0xAB: "Copley"}  # makers whose accelerations are in other units than counts/s2
+# objects that scale accelerations, with the values that leave them in counts/s2: SI units, dimension and notation index
+_UNITS = {0x60AA: (0, 0xB55700), 0x60A9: (0, 0xB50300), 0x60A8: (0, 0xB50000), 0x608E: (0,), 0x608D: (0,)}
+_FACTORS = (0x6091, 0x6093, 0x6094, 0x6095, 0x6096, 0x6097)  # numerator and divisor: gear ratio, factors
+_MAKER = 0x1018, 1
+_SAME = 1e-3  # by so much a ramp may be slower and is not reported: rounding
+Read = Callable[[int, int], int | None]  # an unsigned object; None where the drive does not give it
+
+
+@dataclass(frozen=True)
+class QuickStop:
+    """What the drive's own quick stop does, in words; how fast it brakes the joint, None where that is not known."""
+
+    words: str
+    radps2: float | None = None
+    index: int = 0  # of the object that holds the ramp
+    rad_per_count: float = 0.0
+
+    def problem(self, settings: CanopenSettings) -> str:
+        """One line where it brakes slower than the loop's own stop, or than the limits need; "" else."""
+        speed, brake = settings.velocity_max_radps, settings.brake_radps2
+        if self.radps2 is None or not speed:
+            return ""
+        seconds, way = speed / self.radps2, 0.5 * speed**2 / self.radps2
+        room = settings.position_max_rad - settings.position_min_rad
+        needs = [
+            (brake, f"slower than sequence.brake_radps2 (={brake:g})"),
+            (0.5 * speed**2 / room, f"farther than between the position limits ({room:g} rad)"),
+        ]
+        if settings.stop_timeout_s:
+            longest = f"longer than sequence.stop_timeout_s (={settings.stop_timeout_s:g})"
+            needs.append((speed / settings.stop_timeout_s, longest))
+        missed = [(radps2, words) for radps2, words in needs if self.radps2 < radps2 * (1.0 - _SAME)]
+        if not missed:
+            return ""
+        least = math.ceil(max(radps2 for radps2, _ in missed) / self.rad_per_count)
+        return (
+            f"{self.words}, {seconds:.2g} s and {way:.2g} rad from limits.velocity_max_radps (={speed:g}): "
+            f"{', '.join(words for _, words in missed)}; {self.index:04X} should be {least} or more"
+        )
+
+
+def _unit_of_its_own(read: Read, settings: CanopenSettings) -> str:
+    """Why accelerations may be in another unit than counts of the encoder per s2; "" where nothing says so."""
+    if settings.velocity_unit != "counts/s":
+        return f"drive.velocity_unit is {settings.velocity_unit}"
+    maker = _OWN_UNITS.get(read(*_MAKER) or settings.vendor_id or 0)
+    if maker is not None:
+        return f"{maker} has a unit of its own"
+    for index, plain in _UNITS.items():
+        if (value := read(index, 0)) is not None and value not in plain:
+            return f"{index:04X} is {value:X}h"
+    pairs = {index: (read(index, 1), read(index, 2)) for index in (*_FACTORS, 0x6092, 0x608F)}
+    for index in _FACTORS:
+        above, below = pairs[index]
+        if above is not None and below is not None and above != below:
+            return f"{index:04X} is {above}:{below}"
+    (feed, turns), (increments, motor_turns) = pairs[0x6092], pairs[0x608F]
+    if feed and turns and increments and motor_turns and feed * motor_turns != increments * turns:
+        return f"6092 is {feed}:{turns}"
+    return ""
+
+
+def quick_stop_of(read: Read, settings: CanopenSettings) -> QuickStop:
+    """By 605A as a run sets it, and by the ramp that it names; nothing is written."""
+    option = settings.quick_stop_option
+    if read(0x605A, 0) is None:
+        return QuickStop("no object 605A: how the drive's own quick stop brakes is not known")
+    start = f"the drive's own quick stop (605A = {option})"
+    index = QUICK_STOP_RAMPS.get(option, 0)
+    if not index:
+        return QuickStop(f"{start} {_OTHER_REACTIONS[option]}")
+    if index == 0x6084 and settings.mode in ("pv", "velocity or torque"):
+        return QuickStop(f"{start} brakes along 6084, which a run makes steeper than its motions where it needs it")
+    value = read(index, 0)
+    if not value:
+        lacks = f"no {index:04X} that can be read" if value is None else f"{index:04X} is 0"
+        return QuickStop(f"{start}: {lacks}, how fast it brakes is not known")
+    if why := _unit_of_its_own(read, settings):
+        return QuickStop(f"{start} brakes along {index:04X} = {value}, in a unit that is not known: {why}")
+    rad_per_count = joint_angle_per_count_rad(settings)
+    radps2 = value * rad_per_count
+    of_mode = index == 0x6084 and settings.mode in ("cst", "tq", "auto")
+    condition = ", unless its torque mode has a ramp of its own" if of_mode else ""
+    words = f"{start} brakes with {radps2:.3g} rad/s2 at the joint ({index:04X} = {value}{condition})"
+    return QuickStop(words, radps2, index, rad_per_count)
+
+
+# --- the deadline of the RPDO ---
 
 
 def rpdo_deadline_ms(settings: CanopenSettings) -> int:

@@ -28,9 +28,11 @@ from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from jointctl.drivers.can.socketcan import SHORT_QUEUE, link_problem, link_state, up_command
 from jointctl.drivers.canopen.cia import SDO_ANSWER_ID, SDO_REQUEST_ID
+from jointctl.drivers.canopen.watchdog import quick_stop_of
 from jointctl.drivers.errors import BusError
-from jointctl.tools.configuration.canopen import HIGHEST_LOAD, canopen_section, cycle_bytes
+from jointctl.tools.configuration.canopen import HIGHEST_LOAD, canopen_section, canopen_settings, cycle_bytes
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.subject import Refusal, SdoReader, canopen_network, subject_of_config
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE
 from jointctl.tools.session.portable_loop import HIGHEST_RATE_HZ
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
@@ -332,6 +334,32 @@ def drive_finding(config: Config) -> Finding:
         )
         return Finding("drive", NOTE, text, remedy, numbers)
     return Finding("drive", OK if good else NOTE, text, "" if good else "SDO is being lost: wiring, bus load", numbers)
+
+
+def quick_stop_finding(config: Config) -> Iterator[Finding]:
+    """How fast the drive's own quick stop brakes, by its objects; nothing where it gives none."""
+    subject, settings = subject_of_config(config), canopen_settings(config)
+    try:
+        with canopen_network(subject) as network:
+            reader = SdoReader(network, subject.required_node(), subject.objects())
+            if isinstance(reader.upload(0x1000), Refusal):
+                return
+
+            def unsigned(index: int, sub: int) -> int | None:
+                data = reader.upload(index, sub)
+                return None if isinstance(data, Refusal) else int.from_bytes(data, "little")
+
+            found = quick_stop_of(unsigned, settings)
+    except BusError:  # has been reported of the drive
+        return
+    numbers = {} if found.radps2 is None else {"radps2": found.radps2}
+    remedy = "see the drive's manual, or try it with a joint that cannot hurt or be hurt"
+    if problem := found.problem(settings):
+        remedy = f"set {found.index:04X} in the drive, by the maker's software, and store it there"
+    yield Finding(
+        "quick stop", OK if numbers and not problem else NOTE, problem or found.words,
+        "" if numbers and not problem else remedy, numbers,
+    )  # fmt: skip
 
 
 def start_time_s(cache: Path | None = None) -> float:

@@ -98,12 +98,15 @@ class CanopenBench(BenchDrive):
             bus_budget,
             drive_finding,
             interface_state,
+            quick_stop_finding,
         )
 
         yield from adapters(config)
         yield from adapters_not_up(config)
         yield bus_budget(config)
-        yield drive_finding(config)
+        yield (answer := drive_finding(config))
+        if answer.numbers:
+            yield from quick_stop_finding(config)
         yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
 
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:

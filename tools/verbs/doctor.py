@@ -1,8 +1,8 @@
 """`jointctl doctor`: what this computer, its CAN adapter and the configuration allow, with a remedy for what is amiss.
 
-Without --motion it reads and measures only: nothing moves, no object of the drive is written; the one thing sent on the
-bus is the SDO request to read object 1000h (device type).  With it: is torque and encoder the right way round, before
-the first run?
+Without --motion it reads and measures only: nothing moves, no object of the drive is written; all that is sent on the
+bus is SDO requests to read: the device type (1000h), and what says how the drive's own quick stop brakes.  With it: is
+torque and encoder the right way round, before the first run?
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def doctor(
     ] = None,
     assume_yes: Yes = False,
 ) -> int:
-    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.
+    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget, quick stop.
 
     Moves nothing; with --motion it asks first, then checks the directions of torque and encoders and their counts.
     """

@@ -30,6 +30,7 @@ from jointctl.tools.inspection.health import (
     interface_state,
     kernel_cache,
     kernel_findings,
+    quick_stop_finding,
     sdo_round_trips_us,
     wake_up,
 )
@@ -187,6 +188,51 @@ class TestBus:
         monkeypatch.setattr(health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
         found = drive_finding(changed(config, loop__rate_Hz=rate_Hz))
         assert (found.status, found.numbers["allowed_rate_Hz"]) == (status, 600.0)
+
+
+def quick_stop(joint: Any, config: Config, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> list[Finding]:
+    end = lambda *_, **__: can.Bus(interface="virtual", channel=joint.channel)  # noqa: E731
+    monkeypatch.setattr("jointctl.tools.inspection.subject.open_python_can", end)
+    return list(quick_stop_finding(changed(config, **changes)))
+
+
+class TestQuickStop:
+    """How fast the drive brakes by itself, at the joint."""
+
+    def test_a_fast_one_is_well_and_nothing_is_written(
+        self, joint: Any, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (found,) = quick_stop(joint, config, monkeypatch)
+        assert (found.topic, found.status, found.remedy) == ("quick stop", OK, "")
+        assert found.text == (
+            "the drive's own quick stop (605A = 2) brakes with 12 rad/s2 at the joint (6085 = 1000000)"
+        )
+        assert found.numbers["radps2"] == pytest.approx(11.98, abs=0.01)
+        assert {data[0] for identifier, data in joint.requests if identifier == 0x601} == {0x40}
+
+    def test_a_slow_one_is_a_note_with_what_is_expected(
+        self, joint: Any, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        joint.answers[0x6085, 0] = 66_755
+        (found,) = quick_stop(joint, config, monkeypatch)
+        assert (found.status, "6085" in found.remedy) == (NOTE, True)
+        assert "brakes with 0.8 rad/s2 at the joint (6085 = 66755), 1.2 s and 0.62 rad from" in found.text
+        assert found.text.endswith("slower than sequence.brake_radps2 (=2); 6085 should be 166887 or more")
+
+    @pytest.mark.parametrize("missing", [0x6085, 0x605A])
+    def test_one_that_is_not_known_is_a_note(
+        self, joint: Any, config: Config, missing: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        joint.unread[missing, 0] = 0x06020000
+        (found,) = quick_stop(joint, config, monkeypatch)
+        assert (found.status, found.numbers) == (NOTE, {})
+        assert "not known" in found.text
+
+    def test_a_node_that_does_not_answer_has_none(
+        self, empty_bus: Any, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("jointctl.tools.inspection.subject.TIMEOUT_S", 0.01)
+        assert quick_stop(empty_bus, config, monkeypatch) == []
 
 
 class TestReport:

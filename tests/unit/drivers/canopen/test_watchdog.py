@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import struct
 import time
@@ -14,12 +15,14 @@ from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.watchdog import (
     BEATS,
     PERIOD_S,
+    QuickStop,
     WatchdogGuard,
     arm_reaction,
     arm_rpdo_deadline,
     clear_rpdo_deadlines,
     is_kept,
     prove_watchdog,
+    quick_stop_of,
     rpdo_deadline_ms,
     rpdo_identifiers,
     watched_nodes,
@@ -519,3 +522,136 @@ def test_every_object_that_cannot_be_read_is_told() -> None:
     answers.confirm()
     told = [answers.says(index, None) for index in (0x6007, 0x6061) for _ in range(3)]
     assert [len(warnings) for warnings in told] == [0, 0, 1, 0, 0, 1]
+
+
+# --- how fast the drive's own quick stop brakes ---
+A_TURN = 524288.0 / math.tau  # counts of a rad, with the encoder on the joint
+FAST = {(0x605A, 0): 2, (0x6085, 0): 1_000_000, (0x6084, 0): 400_000}  # 12.0 and 4.8 rad/s2
+
+
+def judged(settings: Any, held: dict[tuple[int, int], int], **changes: Any) -> tuple[QuickStop, str]:
+    settings = dataclasses.replace(settings, **changes)
+    found = quick_stop_of(lambda index, sub: held.get((index, sub)), settings)
+    return found, found.problem(settings)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "radps2"),
+    [(1, 0x6084, 400_000), (2, 0x6085, 1_000_000), (5, 0x6084, 400_000), (6, 0x6085, 1_000_000)],
+)
+@pytest.mark.parametrize(("mode", "hedged"), [("cst", True), ("auto", True), ("csv", False), ("csp", False)])
+def test_the_ramp_is_that_which_605a_names(
+    settings_of_virtual_joint: Any, option: int, value: int, radps2: float, mode: str, hedged: bool
+) -> None:
+    found, problem = judged(settings_of_virtual_joint, FAST, quick_stop_option=option, mode=mode)
+    assert (found.index, found.radps2, problem) == (value, pytest.approx(radps2 / A_TURN), "")
+    assert (
+        f"605A = {option}) brakes with {radps2 / A_TURN:.3g} rad/s2 at the joint ({value:04X} = {radps2}" in found.words
+    )
+    assert ("unless its torque mode has a ramp of its own" in found.words) == (hedged and value == 0x6084)
+
+
+def test_the_encoder_on_the_motor_makes_it_slower_at_the_joint(settings_of_virtual_joint: Any) -> None:
+    """The 6085 of a soft joint was 0.8 rad/s2, and no one said so."""
+    found, problem = judged(settings_of_virtual_joint, FAST, encoder_on_motor=True, counts_per_turn=65536)
+    assert found.radps2 == pytest.approx(0.7924, rel=1e-3)
+    assert problem == (
+        "the drive's own quick stop (605A = 2) brakes with 0.792 rad/s2 at the joint (6085 = 1000000), 1.3 s and "
+        "0.63 rad from limits.velocity_max_radps (=1): slower than sequence.brake_radps2 (=2); 6085 should be "
+        "2524152 or more"
+    )
+    _, problem = judged(
+        settings_of_virtual_joint, FAST | {(0x6085, 0): 2_524_152}, encoder_on_motor=True, counts_per_turn=65536
+    )
+    assert problem == ""
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"brake_radps2": 11.9}, ""),
+        ({"brake_radps2": 12.1}, "slower than sequence.brake_radps2 (=12.1); 6085 should be 1009661 or more"),
+        ({"velocity_max_radps": 3.0, "stop_timeout_s": 0.26}, ""),
+        (
+            {"velocity_max_radps": 3.0, "stop_timeout_s": 0.24},
+            "longer than sequence.stop_timeout_s (=0.24); 6085 should be 1043038 or more",
+        ),
+        ({"velocity_max_radps": 5.78}, ""),
+        (
+            {"velocity_max_radps": 5.81},
+            "farther than between the position limits (1.4 rad); 6085 should be 1005969 or more",
+        ),
+        ({"velocity_max_radps": None, "brake_radps2": 20.0}, ""),
+    ],
+)
+def test_it_is_compared_with_the_loops_stop_and_the_limits(
+    settings_of_virtual_joint: Any, changes: dict[str, Any], words: str
+) -> None:
+    _, problem = judged(settings_of_virtual_joint, FAST, **changes)
+    assert problem.endswith(words) if words else not problem
+
+
+@pytest.mark.parametrize(
+    ("held", "changes", "words"),
+    [
+        ({(0x6085, 0): 1}, {}, "no object 605A: how the drive's own quick stop brakes is not known"),
+        ({(0x605A, 0): 2}, {}, "no 6085 that can be read, how fast it brakes is not known"),
+        (FAST | {(0x6085, 0): 0}, {}, "6085 is 0, how fast it brakes is not known"),
+        (FAST, {"quick_stop_option": 0}, "takes its power at once: the joint coasts"),
+        (FAST, {"quick_stop_option": 3}, "brakes at its current limit: how fast is not known"),
+        (FAST, {"quick_stop_option": 8}, "brakes at its voltage limit: how fast is not known"),
+        (FAST, {"quick_stop_option": 1, "mode": "pv"}, "which a run makes steeper than its motions where it needs it"),
+        (FAST, {"velocity_unit": "r/min"}, "in a unit that is not known: drive.velocity_unit is r/min"),
+        (FAST, {"vendor_id": 0xFB}, "in a unit that is not known: maxon has a unit of its own"),
+        (FAST | {(0x1018, 1): 0xAB}, {}, "in a unit that is not known: Copley has a unit of its own"),
+        (FAST | {(0x60A9, 0): 0xB44700}, {}, "in a unit that is not known: 60A9 is B44700h"),
+        (FAST | {(0x60AA, 0): 0xB54700}, {}, "in a unit that is not known: 60AA is B54700h"),
+        (FAST | {(0x6097, 1): 10, (0x6097, 2): 1}, {}, "in a unit that is not known: 6097 is 10:1"),
+        (FAST | {(0x6096, 1): 1, (0x6096, 2): 60}, {}, "in a unit that is not known: 6096 is 1:60"),
+        (FAST | {(0x6091, 1): 121, (0x6091, 2): 1}, {}, "in a unit that is not known: 6091 is 121:1"),
+        (
+            FAST | {(0x6092, 1): 3600, (0x6092, 2): 1, (0x608F, 1): 65536, (0x608F, 2): 1}, {},
+            "in a unit that is not known: 6092 is 3600:1",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_not_known_is_said_and_not_judged(
+    settings_of_virtual_joint: Any, held: dict[tuple[int, int], int], changes: dict[str, Any], words: str
+) -> None:
+    found, problem = judged(settings_of_virtual_joint, held, brake_radps2=1e6, **changes)
+    assert found.words.endswith(words)
+    assert (found.radps2, problem) == (None, "")
+
+
+@pytest.mark.parametrize(
+    "plain",
+    [
+        {(0x60AA, 0): 0xB55700, (0x60A9, 0): 0xB50300, (0x60A8, 0): 0, (0x608D, 0): 0},
+        {(0x6091, 1): 1, (0x6091, 2): 1, (0x6097, 1): 3, (0x6097, 2): 3, (0x6096, 1): 7},
+        {(0x6092, 1): 65536, (0x6092, 2): 1, (0x608F, 1): 65536, (0x608F, 2): 1},
+        {(0x1018, 1): 0x9A},
+    ],
+)
+def test_objects_that_scale_nothing_leave_it_known(
+    settings_of_virtual_joint: Any, plain: dict[tuple[int, int], int]
+) -> None:
+    found, _ = judged(settings_of_virtual_joint, FAST | plain)
+    assert found.radps2 == pytest.approx(1_000_000 / A_TURN)
+
+
+@pytest.mark.parametrize(("value", "slow"), [(150_000, True), (170_000, False)])
+def test_commissioning_says_how_fast_the_quick_stop_brakes(commission: Any, joint: Any, value: int, slow: bool) -> None:
+    joint.device.objects.store(0x6085, 0, struct.pack("<I", value))
+    report = commission()
+    assert report.settings["quick stop"].startswith("the drive's own quick stop (605A = 2) brakes with ")
+    assert [text for text in report.remarks if "slower than sequence.brake_radps2 (=2)" in text and "6085" in text] == [
+        text for text in report.remarks if "quick stop" in text
+    ]
+    assert any("quick stop" in text for text in report.remarks) is slow
+    assert joint.downloads(0x6085) == []
+
+
+def test_a_ramp_that_the_drive_does_not_give_is_not_known(commission: Any, joint: Any) -> None:
+    joint.unread[0x6085, 0] = 0x06010001  # write-only
+    report = commission()
+    assert report.settings["quick stop"].endswith("no 6085 that can be read, how fast it brakes is not known")
