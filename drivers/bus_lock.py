@@ -248,7 +248,7 @@ class BusLock:
     def _take_caller(self, callers: dict[socket.socket, bytes], selector: selectors.BaseSelector) -> None:
         assert self._server is not None
         with contextlib.suppress(OSError):
-            caller, _ = self._server.accept()
+            caller = keep_from_forks(self._server.accept()[0])
             caller.setblocking(False)
             if len(callers) >= _CALLERS:
                 oldest = next(iter(callers))

@@ -29,11 +29,14 @@ def keep_from_forks(held: Held) -> Held:
 
 
 def _let_go() -> None:
-    null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
     for held in list(_held):
-        with contextlib.suppress(OSError, ValueError):  # closed already
-            os.dup2(null, held.fileno(), inheritable=False)
-    os.close(null)
+        with contextlib.suppress(Exception):  # closed already, as its library says it
+            number = held.fileno()
+            os.close(number)  # before another one is opened: there may be no room for one more
+            null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+            if null != number:
+                os.dup2(null, number, inheritable=False)
+                os.close(null)
 
 
 if hasattr(os, "register_at_fork"):

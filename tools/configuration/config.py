@@ -166,7 +166,7 @@ class Config(Section):
 
     def anchored(self) -> Config:
         """The same wherever the working directory goes: its file and its log folder by their full paths."""
-        folder = os.path.abspath(self.log.folder)
+        folder = str(Path(self.log.folder).absolute())
         found = self.model_copy(update={"log": self.log.model_copy(update={"folder": folder})})
         found._path = self._path.absolute()
         return found

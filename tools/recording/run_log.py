@@ -470,6 +470,13 @@ class RunLogWriter:
             self._mcap.flush()
         self._flushed_at_s = self._clock()
 
+    def is_in_place(self) -> bool:
+        """Whether the file that is being written is still the one at its path."""
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), os.stat(self.path))
+        except OSError:
+            return False
+
     def close(self) -> None:
         """Finish the file (index and summary); may be called twice."""
         if not self._file.closed:

@@ -18,6 +18,7 @@ from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
 from jointctl.drivers.errors import (
     BusError,
+    DataError,
     DeviceError,
     JointctlError,
     MotionFault,
@@ -227,28 +228,39 @@ class Session:
         if plan.arm is None:
             loop.block.table[:] = placed.table
         placed.constants.sequence.may_enable[:] = 0
-        with contextlib.ExitStack() as stack:
-            display = stack.enter_context(self._make_display(reports[0]))
-            watches: list[RunWatch] = []
-            orders: list[ViewerRequest] = []
-            for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
-                metadata = run_metadata(joint.config, report)
-                if plan.arm is not None:  # its [motion] is what the joint does, and not the joint's own [trajectory]
-                    arm = plan.arm.config
-                    metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
-                if plan.log_every > 1:
-                    metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
-                names = (plan.names if axis == 0 else (joint.name,)) if joint.name else JOINT_NAMES
-                log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
-                kept = stack.enter_context(KeptRecords(joint.log_path.parent))
-                shown: Display = JointDisplay(display, joint.name, orders, axis) if joint.name else display
-                # frames and troubles of a bus belong to no joint: they are in the log of the first one on it
-                no_bus = replace(around[0], bus_watch=BusWatch(joint.config, None), recorder=None)
-                own = around.get(axis, no_bus)
-                points, together = (self._set_points, None) if axis == 0 else (None, watches[0].log)
-                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, points, together)
-                watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
-            return self._carry_out(drives, loop, placed.constants, reports, watches)
+        result: RunResult | None = None
+        try:
+            with contextlib.ExitStack() as stack:
+                display = stack.enter_context(self._make_display(reports[0]))
+                watches: list[RunWatch] = []
+                orders: list[ViewerRequest] = []
+                for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
+                    metadata = run_metadata(joint.config, report)
+                    if (
+                        plan.arm is not None
+                    ):  # its [motion] is what the joint does, and not the joint's own [trajectory]
+                        arm = plan.arm.config
+                        metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
+                    if plan.log_every > 1:
+                        metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+                    names = (plan.names if axis == 0 else (joint.name,)) if joint.name else JOINT_NAMES
+                    log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
+                    kept = stack.enter_context(KeptRecords(joint.log_path.parent))
+                    shown: Display = JointDisplay(display, joint.name, orders, axis) if joint.name else display
+                    # frames and troubles of a bus belong to no joint: they are in the log of the first one on it
+                    no_bus = replace(around[0], bus_watch=BusWatch(joint.config, None), recorder=None)
+                    own = around.get(axis, no_bus)
+                    points, together = (self._set_points, None) if axis == 0 else (None, watches[0].log)
+                    parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, points, together)
+                    watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
+                result = self._carry_out(drives, loop, placed.constants, reports, watches)
+        except DataError as error:
+            if result is None:
+                raise
+            self._output.warning(f"{error.message}: this log is lost")
+            result = replace(result, log_lost=True)
+        assert result is not None
+        return result
 
     def _carry_out(
         self, drives: DriveGroup, loop: LoopHandle, constants: np.recarray, reports: Sequence[CommissioningReport],
@@ -274,19 +286,13 @@ class Session:
                 time.sleep(POLL_S)
         except MotionFault as error:
             state = self._made_safe(drives)
-            for each in watches:
-                each.take_records(last=True)
-            for each in watches:
-                each.tell_bus_news()
-            watch.log.write_event(ERROR, "supervisor", str(error))
+            self._log_end(watches, error)
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, signals, StopRequest.QUICK_STOP)
-            for each in watches:
-                each.take_records(last=True)
             # `jointctl stop` sends such frames as well
             if not signals.commanded_ns and not self._explained_by_restart(error, loop):
-                watch.log.write_event(ERROR, "supervisor", str(error))
+                self._log_end(watches, error)
                 raise MotionFault(error.message, error.hint) from None
         except BaseException:
             self._brake(loop, signals)
@@ -325,6 +331,16 @@ class Session:
         return replace(results[0], others=tuple(results[1:]))
 
     @staticmethod
+    def _log_end(watches: Sequence[RunWatch], error: JointctlError) -> None:
+        """What has ended the run, in the logs; it is told all the same where they cannot be written."""
+        with contextlib.suppress(DataError):
+            for each in watches:
+                each.take_records(last=True)
+            for each in watches:
+                each.tell_bus_news()
+            watches[0].log.write_event(ERROR, "supervisor", str(error))
+
+    @staticmethod
     def _explained_by_restart(error: JointctlError, loop: LoopHandle) -> bool:
         """Objects of a drive that has restarted are as they were at power-on: no other program has changed them."""
         verdicts = [loop.of_axis(axis).verdict()[0] for axis in range(loop.block.axes)]
@@ -361,7 +377,7 @@ class Session:
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
         log_path = watch.joint.log_path
-        if log_lost := not log_path.exists():
+        if log_lost := not watch.log.is_in_place():
             self._output.warning(f"{log_path}: was removed or renamed during the run: this log is lost")
         records = watch.kept.records()
         state = loop.block.state[0]

@@ -316,13 +316,16 @@ def response_by_any_law(
     static_Nm = static_friction_Nm(before) or 0.0
     much = static_Nm > MUCH_FRICTION_radps2 * before.joint.inertia_kgm2
     laws = [law for law in (_MUCH_FRICTION if much else _LITTLE_FRICTION) if law != FED or static_Nm > 0.0]
-    for stiff in (FED_STIFF, FED_STIFFEST):
-        if not _passes(config_of_response(before, torque_Nm, _LAWS[stiff])):
-            laws.remove(stiff)
+    # the gate judges the joint that is believed, also under the law for a heavier one
+    heavy = STIFFEST._replace(kp_ps2=HEAVIER * STIFFEST.kp_ps2, kv_ps=HEAVIER * STIFFEST.kv_ps)
+    for name, stiff in ((FED_STIFF, STIFF), (FED_STIFFEST, heavy)):
+        if not _passes(config_of_response(before, torque_Nm, stiff)):
+            laws.remove(name)
 
     def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
         believed = _with_inertia(before, HEAVIER * before.joint.inertia_kgm2) if law == FED_STIFFEST else before
         task = task_by(law, believed, legs, torque_Nm)
+        task = replace(task, largest_Nm=min(task.largest_Nm, largest_peak_Nm(before)))  # which was announced
         if law != ALONE:
             carrier.output.note(f"  law: {law}")
         try:

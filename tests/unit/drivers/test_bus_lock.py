@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -36,6 +37,7 @@ from jointctl.drivers.bus_lock import (
 )  # fmt: skip
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
+from jointctl.drivers.port_users import keep_from_forks
 from tests.python_process import forked
 
 
@@ -563,6 +565,25 @@ def test_a_forked_process_does_not_keep_the_bus_nor_is_it_ended_by_a_stop(channe
         with BusLock("socketcan", channel):
             stack.enter_context(forked())
         assert BusLock("socketcan", channel).close() is None
+
+
+def test_what_cannot_be_let_go_and_a_full_table_keep_a_forked_process_from_no_lock(channel: str) -> None:
+    """A closed adapter says so by an error of its library; with no descriptor left the null device cannot be opened."""
+
+    class Closed:
+        def fileno(self) -> int:
+            raise RuntimeError("closed")
+
+    closed = [keep_from_forks(Closed()) for _ in range(20)]  # in any order with the lock's own
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with BusLock("socketcan", channel), ExitStack() as stack:
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        reading, writing = os.pipe()  # of `forked`
+        for number in (reading, writing):
+            os.close(number)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (writing + 1, hard))
+        assert not is_marked(stack.enter_context(forked()), lock_name("socketcan", channel))
+    assert len(closed) == 20
 
 
 def test_no_descriptor_is_left_behind(channel: str) -> None:

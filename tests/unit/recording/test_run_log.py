@@ -420,6 +420,18 @@ def test_what_has_ended_a_run_goes_before_a_log_without_room(tmp_path: Path) -> 
         run_that_fails()
 
 
+def test_a_log_in_whose_place_is_another_file_is_not_there(tmp_path: Path) -> None:
+    folder, path = tmp_path / "runs", tmp_path / "runs" / "run.mcap"
+    with RunLogWriter(path, {}) as log:
+        assert log.is_in_place()
+        folder.rename(tmp_path / "moved")
+        assert not log.is_in_place()
+        (tmp_path / "other").mkdir()
+        folder.symlink_to("other")
+        path.write_text("no log")
+        assert not log.is_in_place()
+
+
 def test_kept_records_need_no_folder_any_more(tmp_path: Path) -> None:
     folder = tmp_path / "runs"
     folder.mkdir()

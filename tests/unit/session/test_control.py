@@ -19,7 +19,7 @@ import pytest
 
 from jointctl.drivers import bus_lock, stop_note
 from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name, wait_for_answers
-from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.drivers.errors import BusError, DataError, JointctlError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import Fault, StopRequest
@@ -39,6 +39,13 @@ from jointctl.tools.session.control import (
 )
 from jointctl.tools.session.session import NOTED_WITHIN_NS, Session, came_before
 from jointctl.tools.verbs.start import Interruption
+
+
+def test_what_has_ended_a_run_is_told_where_its_log_takes_nothing_more() -> None:
+    watch = Mock()
+    watch.take_records.side_effect = DataError("runs: cannot be written: No space left on device")
+    assert Session._log_end([watch], BusError("the loop was killed")) is None
+    watch.take_records.assert_called_once_with(last=True)
 
 
 @pytest.mark.parametrize(
