@@ -60,7 +60,7 @@ def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
         drive.commission()
         brake = switch_off.brake
 
-        def stopped_meanwhile(objects: Any, sleep: Any) -> None:
+        def stopped_meanwhile(objects: Any, sleep: Any, longest_s: float) -> None:
             monkeypatch.setattr(switch_off, "brake", brake)
             drive._node.nmt.send_command(2)
             brake(objects, sleep)
