@@ -6,6 +6,7 @@ import io
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from jointctl.drivers.errors import (
     DataError,
     JointctlError,
     LimitCycle,
+    MarginError,
     MotionFault,
     TooFewPoints,
     UsageError,
@@ -27,7 +29,8 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
-from jointctl.tools.tuning.carry_out import FED_STIFF, FED_STIFFEST, Carrier
+from jointctl.tools.tuning.carry_out import FED_STIFF, FED_STIFFEST, Carrier, TooWeak
+from jointctl.tools.verbs import tune_steps
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
@@ -152,6 +155,20 @@ def test_a_motor_that_weighs_more_by_its_file_than_the_whole_joint_is_found_all_
     assert found.joint.inertia_kgm2 == pytest.approx(0.84, rel=0.05)
     assert found.reducer is not None
     assert found.reducer.motor_inertia_kgm2 == pytest.approx(0.3, rel=0.1)
+
+
+@pytest.mark.parametrize("error", [MarginError, TooWeak])
+def test_a_law_that_cannot_look_whether_the_joint_is_the_same_is_no_end(
+    monkeypatch: pytest.MonkeyPatch, error: type[MotionFault], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tune_steps, "require_same_joint", Mock(side_effect=error("it swings")))
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    job = Tune(load_config(shipped_config("precise")), TuneOptions(lockstep=True), carrier, tmp_path)
+    job.state |= {"direction": [{"numbers": {}}], "response": {"law": FED_STIFF}}
+    job.fit, job.response = Mock(), Mock()
+    job._require_same_joint("before the gains")
+    assert "warning: whether it is the same joint before the gains is not measured: it swings" in err.getvalue()
 
 
 def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -173,11 +173,14 @@ def draw_arm_scenario(arm: ArmConfig, seed: int, number: int, *, pairs: bool = F
     return ArmScenario(faulty, tuple(joints), tuple(scales))
 
 
-def _sized(event: Any, size: float) -> Any:
+AnEvent = TypeVar("AnEvent", Event, Scenario)
+
+
+def _sized(event: AnEvent, size: float) -> AnEvent:
     return replace(event, magnitude=size * event.magnitude) if event.kind in OF_TORQUE else event
 
 
-def _held(event: Any, config: Config) -> Any:
+def _held(event: AnEvent, config: Config) -> AnEvent:
     """A harmless load that stays must not move a joint without a brake once its power is off."""
     if event.kind is not FaultKind.LOAD_JUMP or not event.harmless:
         return event
@@ -265,7 +268,11 @@ def masses_of(arm: ArmConfig) -> Masses:
 
 
 def envelopes(
-    joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: np.recarray, reached_radps: Any = np.inf
+    joints: LockstepArm,
+    masses: Masses,
+    scenario: ArmScenario,
+    constants: np.recarray,
+    reached_radps: float | np.ndarray = np.inf,
 ) -> list[Envelope]:
     """Of each joint, see the module; `reached_radps`: the greatest speed of each in the run."""
     arm, touching = joints.arm, scenario.touching(joints.arm.joints)

@@ -332,7 +332,7 @@ class Session:
 
     @staticmethod
     def _log_end(watches: Sequence[RunWatch], error: JointctlError) -> None:
-        """What has ended the run, in the logs; it is told all the same where they cannot be written."""
+        """What has ended the run, in the logs; it is shown all the same where they cannot be written."""
         with contextlib.suppress(DataError):
             for each in watches:
                 each.take_records(last=True)

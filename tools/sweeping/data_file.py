@@ -172,7 +172,7 @@ class SweepFile:
     def close(self) -> None:
         """Files without one row are removed: nothing was measured, and they would be in the way of the next try."""
         self._to_disk.shutdown()
-        with suppress(OSError):  # a full disk, which `add` has told
+        with suppress(OSError):  # a full disk, which `add` has reported
             self._stream.close()
         if not self._sidecar["measured"]:
             self.path.unlink(missing_ok=True)

@@ -70,6 +70,7 @@ from jointctl.tools.tuning.carry_out import (
     LEAST_LEGS,
     Carrier,
     NotCarriedOut,
+    TooWeak,
     VERIFY_s,
     require_one_joint,
     require_same_joint,
@@ -457,7 +458,7 @@ class Tune:
         task = task_by(law, self._before_friction(), LEAST_LEGS)
         try:
             require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
-        except MarginError as error:  # the law of the response, on the joint that is known to be soft now
+        except (MarginError, TooWeak) as error:  # the law of the response, on the joint that is known now
             self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 
     @staticmethod
