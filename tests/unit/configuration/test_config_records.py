@@ -33,7 +33,7 @@ from jointctl.tools.configuration.conversions import (
 from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import approach_s, trajectory_table
-from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section
+from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section, Sequence
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
@@ -41,7 +41,7 @@ from tests.sessions import constants_of
 NO_TABLE = np.zeros((1, 5))
 
 
-COPIED = (Limits, Loop, Joint, Encoder)
+COPIED = (Limits, Sequence, Loop, Joint, Encoder)
 OF_THE_ENCODER = {"encoder_on_motor", "encoder_direction"}
 
 
