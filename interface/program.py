@@ -435,11 +435,7 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
 
     options = observers(wanted.foxglove, wanted.ros2, allow_remote=wanted.allow_remote)
     config, shipped = _loaded(given, kind)
-    if isinstance(config, Config):  # the program may go elsewhere
-        config = config.anchored()
-    else:
-        joints = tuple(joint.anchored() for joint in config.joints)
-        config = replace(config, path=config.path.absolute(), joints=joints)
+    config = config.anchored()  # the program may go elsewhere
     found = "Joint" if isinstance(config, Config) else "Arm"
     if found != kind:
         raise ConfigurationError(f"{config.path}: is no file of {_WORDS[kind]}", f"jointctl.{found} moves it")

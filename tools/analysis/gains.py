@@ -53,7 +53,7 @@ from jointctl.tools.configuration.load import shipped_control
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 STICKY = (25.0, 1.7, 3.0)  # the same of a joint that friction rules
-STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia, from where on and as from where
+STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia: up to the former those above, from the latter on these
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -198,6 +198,11 @@ class ArmConfig:
     @property
     def rate_Hz(self) -> float:
         return self.joints[0].loop.rate_Hz
+
+    def anchored(self) -> ArmConfig:
+        """See `Config.anchored`."""
+        joints = tuple(joint.anchored() for joint in self.joints)
+        return replace(self, path=self.path.absolute(), joints=joints)
 
     def axis_constants(self, tables: Sequence[np.ndarray], starts_rad: Sequence[float] | None = None) -> Any:
         """A record array of N `AxisConstants`; `tables` as of `trajectory_table` of each joint."""

@@ -25,7 +25,6 @@ Where joints have no brake, Coulomb friction F, less ripple and gravity, takes t
 
     |v_i| <= sqrt(2 T (M^-1)_ii),   x_i <= T / F_i
     dT/dt <= -sum_i F_i |v_i| <= -c sqrt(T),   c = min_i F_i / sqrt(M_ii / 2),   so that all stand after 2 sqrt(T) / c
-
 """
 
 from __future__ import annotations
