@@ -102,13 +102,17 @@ class FaultMemory:
     to_controller: FrameQueue  # lockstep: the controller's mailbox
 
 
-def fault_memory(faults: np.ndarray, epoch_ns: int = 0) -> Any:
-    """A record array of one `FaultMemory` for these faults; at most MAX_FAULTS of them."""
+def fault_memory(faults: np.ndarray, epoch_ns: int = 0, axis: int = 0) -> Any:
+    """A record array of one `FaultMemory` for these faults of this axis; at most MAX_FAULTS of them.
+
+    Seed and axis are hashed: states of xorshift64 that differ in few bits yield numbers that differ little at first.
+    """
     if len(faults) > MAX_FAULTS:
         raise ValueError(f"number of faults (={len(faults)}) must be in [0..{MAX_FAULTS}]")
     memory = new(FaultMemory)
     memory[0].epoch_ns = epoch_ns
-    memory[0].random = 0x9E3779B97F4A7C15 ^ (int(faults[0].seed) if len(faults) else 0) or 1
+    seed = int(faults[0].seed) if len(faults) else 0
+    memory[0].random = np.random.SeedSequence((seed, axis)).generate_state(1, np.uint64)[0] or 1
     return memory
 
 
@@ -123,7 +127,7 @@ def fault_rows(of_axes: Sequence[np.ndarray], epoch_ns: int = 0) -> tuple[Any, A
     memories = new(FaultMemory, len(of_axes))
     for axis, faults in enumerate(of_axes):
         rows[axis, : len(faults)] = faults
-        memories[axis] = fault_memory(faults, epoch_ns)[0]
+        memories[axis] = fault_memory(faults, epoch_ns, axis)[0]
     return rows, memories
 
 

@@ -14,7 +14,9 @@ from jointctl.hil.faults import (
     MAX_FAULTS,
     FaultConstants,
     FaultKind,
+    draw,
     fault_memory,
+    fault_rows,
     is_active,
     no_faults,
     pass_frame,
@@ -165,6 +167,17 @@ def test_a_run_with_faults_repeats_bit_for_bit(lockstep: LockstepJoint) -> None:
     assert first.log.tobytes() == again.log.tobytes()
     faults[0].seed = 6
     assert lockstep.run_with_faults(faults, longest_s=4.0).log.tobytes() != first.log.tobytes()
+
+
+def test_the_first_numbers_of_neighbouring_seeds_and_axes_are_spread() -> None:
+    first = np.empty((400, 2))
+    for seed in range(400):
+        faults = one_fault(FaultKind.FRAMES_LOST, 0.5, seed=seed)
+        _, memories = fault_rows([faults, faults])
+        first[seed] = [draw(memory) for memory in memories]
+    for numbers in (first.ravel(), np.abs(np.diff(first)).ravel(), np.abs(np.diff(first, axis=0)).ravel()):
+        assert (numbers.min() < 0.01, numbers.max() > 0.95) == (True, True)
+    assert np.histogram(first, 10, (0.0, 1.0))[0].min() > 50  # of 80 in the mean
 
 
 @pytest.mark.parametrize(
