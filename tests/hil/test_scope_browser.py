@@ -197,8 +197,13 @@ def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, browser:
     if moving:
         start(tab)
         moves(tab)
+    else:
+        os.killpg(browser.process.pid, signal.SIGSTOP)  # a computer too busy to show anything
     stopped = bench.run("stop", "joint.toml")
     assert (stopped.code, stopped.out) == (0, "the drive is switch on disabled\n"), stopped
+    if not moving:
+        time.sleep(5.0)
+        os.killpg(browser.process.pid, signal.SIGCONT)
     assert scope.finished(20.0).code == 130
     assert bench.disabled()
     state_is(tab, "jointctl has ended")

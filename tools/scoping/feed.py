@@ -42,6 +42,7 @@ SERVER_SILENT = (
 SCOPE = "the scope"
 OVER = "over"  # the last stage: the program ends as it should, and nothing moves any more
 LAST_WORD_S = 1.0  # without it the pages fear that the joint may move
+SHOW_END_S = 12.0  # at most, for pages on a busy computer to show the end of the run
 SERVER_ENDED = "{}'s server has ended: no {} shows or stops the joint"
 
 
@@ -319,7 +320,7 @@ def server_process(
                 end.shutdown(socket.SHUT_RDWR)
             end.close()
         try:
-            process.wait(5.0)
+            process.wait(SHOW_END_S + 3.0)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

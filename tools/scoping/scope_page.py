@@ -97,6 +97,8 @@ document.addEventListener('keyup', event => {
 })()
 </script>"""
 
+IS_OVER = """document.querySelector('[data-testid="beat"]')?.textContent.endsWith('OVER') === true"""
+
 
 class StopButton:
     """The button, what became of the last press, and the mark of a page without news for `STALE_s`.

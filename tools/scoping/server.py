@@ -8,6 +8,7 @@ one else, on this computer as elsewhere.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import secrets
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.scoping.feed import COUNT_AGAIN_S, ScopeOrder
+from jointctl.tools.scoping.feed import COUNT_AGAIN_S, OVER, SHOW_END_S, ScopeOrder
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
 from jointctl.tools.scoping.supervisor_link import Feed, stand_aside
 from jointctl.tools.session.display import ViewerRequest, viewer
@@ -32,6 +33,8 @@ MESSAGES = 20  # that a page which was cut off for a moment gets again
 RECONNECT_S = 10.0  # a page that was cut off for less goes on where it was
 COUNT_S = 0.5  # how often the open pages are counted
 RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
+LOOK_S = 0.1  # how often the pages are asked whether they show the end
+ANSWER_S = 1.0  # for a page to say so
 COOKIE = "jointctl_scope"  # how their names begin
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -155,7 +158,29 @@ async def count_viewers(feed: Feed) -> None:
         await asyncio.sleep(COUNT_S)
 
 
-SHOW_END_S = 3.5  # for pages on a busy computer to show the end of the run; the supervisor waits for 5 s
+async def await_end_shown(feed: Feed, history: History, met: set[str]) -> None:
+    """The server ends when every page shows that the program is over: each is asked for its last sign of life.
+
+    One that is cut off or still on its way is waited for as well.  `met`: the clients that had a connection; one
+    without that is no page after some time, it has asked for the address alone.
+    """
+    from nicegui import Client
+
+    from jointctl.tools.scoping.scope_page import IS_OVER
+
+    async def shows_end(client: Client) -> bool:
+        if not client.has_socket_connection:
+            return client.id not in met and time.time() - client.created > RECONNECT_S
+        with contextlib.suppress(TimeoutError):
+            return bool(await client.run_javascript(IS_OVER, timeout=ANSWER_S))
+        return False
+
+    while not (history.ended and history.settings.get("stage") == OVER):
+        await asyncio.sleep(LOOK_S)
+    while not all(await asyncio.gather(*map(shows_end, list(Client.instances.values())))):
+        await asyncio.sleep(LOOK_S)
+    await asyncio.sleep(COUNT_S)  # for the last of the picture
+    feed.shown.set()
 
 
 def serve(order: ScopeOrder) -> None:
@@ -166,6 +191,7 @@ def serve(order: ScopeOrder) -> None:
     from jointctl.tools.scoping.scope_page import STOP_PATH, build_page
 
     feed: Feed | None = None
+    met: set[str] = set()
     if order.feed_fd >= 0:
         history = History(RING_RECORDS, order.joints)
         feed = Feed(socket.socket(fileno=order.feed_fd), history, SHOW_END_S)
@@ -175,11 +201,14 @@ def serve(order: ScopeOrder) -> None:
 
     @ui.page("/", title=f"jointctl: {order.title}")
     def index() -> None:
+        client = ui.context.client
+        client.on_connect(lambda: met.add(client.id))
         build_page(order, history, feed)
 
     if feed is not None:
         app.add_route(STOP_PATH, stop_route(feed), methods=["POST"])
         app.on_startup(lambda: count_viewers(feed))
+        app.on_startup(lambda: await_end_shown(feed, history, met))
     app.add_middleware(AccessControl, token=order.token)
     ui.run(
         host=order.host, port=order.port, show=False, reload=False, show_welcome_message=False, dark=False,

@@ -60,11 +60,13 @@ class Watcher(Protocol):
 
 
 class Feed(threading.Thread):
-    """Receives what the supervisor sends, until it closes the socket; then ends the server."""
+    """Receives what the supervisor sends, until it closes the socket; then ends the server, `after_end_s` later or when
+    the end is `shown`."""
 
     def __init__(self, end: socket.socket, watcher: Watcher, after_end_s: float = AFTER_END_S) -> None:
         super().__init__(name="feed", daemon=True)
         self._end, self._watcher, self._after_end_s = end, watcher, after_end_s
+        self.shown = threading.Event()  # nobody needs the server any more
         self._stops = 0  # since the stage has changed
 
     def run(self) -> None:
@@ -88,7 +90,7 @@ class Feed(threading.Thread):
                 self._watcher.take_settings(found)
             self._watcher.heard_s = time.monotonic()
         self._watcher.ended = True
-        time.sleep(self._after_end_s)
+        self.shown.wait(self._after_end_s)
         os._exit(0)  # the server itself would wait for every open page
 
     def stop(self, who: str) -> int:
