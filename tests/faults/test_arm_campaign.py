@@ -88,6 +88,20 @@ def test_no_pair_violates_an_invariant(arm: ArmConfig, joints: LockstepArm, mass
     assert sum(v.fault != "NONE" for v in found) > len(found) // 3
 
 
+@pytest.mark.parametrize(
+    "number",
+    [
+        854,  # the clock leaps by 44 ms: at 1.3 rad/s the reference would by more than the following error
+        2430,  # the jump is within a gap in the samples, in which the joint may have moved as far
+    ],
+)
+def test_of_a_pair_no_more_is_expected_than_can_be(
+    arm: ArmConfig, joints: LockstepArm, masses: Masses, number: int
+) -> None:
+    verdict = judge_arm(joints, masses, draw_arm_scenario(arm, 77002, number, pairs=True))
+    assert (verdict.violations, verdict.fault) == ((), "NONE")
+
+
 @pytest.mark.slow("two more arms, whose drives are watched for longer")
 @pytest.mark.parametrize("kind", ["brakeless", "flexible"])
 def test_no_scenario_violates_an_invariant_with_other_arms(arm: ArmConfig, tmp_path: Path, kind: str) -> None:

@@ -174,9 +174,11 @@ def test_each_invariant_notices(spoil: Any, words: str) -> None:
         (FaultKind.RPDO_CORRUPTED, 255, False),
         (FaultKind.RPDO_LOST, 251, True),
         (FaultKind.RPDO_LOST, 252, False),
+        (FaultKind.RPDO_REORDERED, 252, True),
+        (FaultKind.RPDO_REORDERED, 253, False),
     ],
 )
-def test_only_a_corrupted_frame_may_enable_after_the_loop_has_given_up(
+def test_only_what_the_wire_holds_may_enable_after_the_loop_has_given_up(
     kind: FaultKind, rises: int, allowed: bool
 ) -> None:
     """Seed 3, scenario 2834: the frame that should have said "off" said "enable"; the next sound one said "off"."""

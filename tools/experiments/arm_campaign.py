@@ -166,6 +166,7 @@ def draw_arm_scenario(arm: ArmConfig, seed: int, number: int, *, pairs: bool = F
         scales.append(float(random.uniform(*INERTIA_SCALES)))
         joint = _sized(joint, size) if axis == faulty else replace(joint, kind=FaultKind.NONE)
         second = _sized(base.second, size) if base.second is not None and axis == has_second else None
+        joint, second = _leaping(joint, arm), None if second is None else _leaping(second, arm)
         if not has_brake(config):
             joint, second = _held(joint, config), None if second is None else _held(second, config)
         joints.append(fitted(config, replace(joint, second=second)))
@@ -177,6 +178,15 @@ AnEvent = TypeVar("AnEvent", Event, Scenario)
 
 def _sized(event: AnEvent, size: float) -> AnEvent:
     return replace(event, magnitude=size * event.magnitude) if event.kind in OF_TORQUE else event
+
+
+def _leaping(event: AnEvent, arm: ArmConfig) -> AnEvent:
+    """The references leap with the clock: where that is harmless, by less than a joint's following error may be."""
+    if event.kind is not FaultKind.CLOCK_STEP or not event.harmless:
+        return event
+    limits = [joint.limits for joint in arm.joints]
+    most_s = min(one.following_error_max_rad / (SPEED_SHARE * one.velocity_max_radps) for one in limits)
+    return replace(event, magnitude=min(event.magnitude, 0.8 * most_s))
 
 
 def _held(event: AnEvent, config: Config) -> AnEvent:

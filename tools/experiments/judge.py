@@ -278,6 +278,9 @@ NEVER_s = 1e6
 TAIL_s = 2.5  # watched after the controller has ended
 AFTER_s = 0.1  # after its last set-point, a program stops the joint
 NOTICED_s = 0.35  # a certain fault that begins so long before the last torque must be noticed, or its least duration
+SAMPLES_LOST = frozenset({FaultKind.FRAMES_LOST, FaultKind.SYNC_LOST, FaultKind.TPDO_LOST, FaultKind.BUS_OFF})
+GAP_BEGINS_s = 0.002  # a gap has the last sample before it as well
+HIDDEN_rad = 0.05  # limits.following_error_max_rad: what is more is noticed after the gap
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 
 
@@ -457,7 +460,8 @@ def _ending(run: LockstepRun, events: Sequence[Event]) -> list[str]:
 def _enabled_again(run: LockstepRun, events: Sequence[Event], start_ns: int, period_ns: int) -> list[str]:
     """The power stage comes on at most once, but for what the wire does by itself.
 
-    A frame may have been under way when the loop gave up; a corrupted one may say "enable", until a sound one comes.
+    A frame may have been under way when the loop gave up, one cycle longer where its successor overtakes it; a
+    corrupted one may say "enable", until a sound one comes.
     """
     enabled = run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED
     rises = np.flatnonzero(enabled[1:] & ~enabled[:-1]) + 1
@@ -469,7 +473,8 @@ def _enabled_again(run: LockstepRun, events: Sequence[Event], start_ns: int, per
     last_row = (int(run.log.time_ns[asked[-1]]) - start_ns) // period_ns
     wire_s = magnitude_of(events, FaultKind.RPDO_DELAYED)
     wire_s += sum(event.duration_s for event in events if event.kind is FaultKind.RPDO_CORRUPTED)
-    late = 2 + int(wire_s * 1e9 / period_ns)
+    overtaken = any(event.kind is FaultKind.RPDO_REORDERED for event in events)
+    late = 2 + overtaken + int(wire_s * 1e9 / period_ns)
     if rises[-1] > last_row + late:
         return [f"enabled again {(rises[-1] - last_row) * period_ns * 1e-6:.0f} ms after the loop had stopped asking"]
     return []
@@ -493,6 +498,17 @@ def _not_noticed(run: LockstepRun, event: Event, period_s: float, start_ns: int)
     return len(watched) > 0 and watched[0] < event.at_s - period_s and event.at_s + noticed_s < watched[-1]
 
 
+def _hidden(event: Event, events: Sequence[Event]) -> bool:
+    """Whether a jump need not be noticed: the reading stands still, or it fits into a gap in the samples."""
+
+    def hides(other: Event) -> bool:
+        within = other.at_s - GAP_BEGINS_s <= event.at_s < other.at_s + other.duration_s
+        in_gap = other.kind in SAMPLES_LOST and within and abs(event.magnitude) <= HIDDEN_rad
+        return other.kind is FaultKind.ENCODER_STUCK or in_gap
+
+    return event.kind is FaultKind.ENCODER_JUMP and any(map(hides, events))
+
+
 def wrong_cause(
     run: LockstepRun, events: Sequence[Event], period_s: float, start_ns: int, *, twin: bool = False,
     also: frozenset[Fault] = frozenset(),
@@ -500,10 +516,7 @@ def wrong_cause(
     """`events`: of the joint, and of the computer; `twin`: the only one is harmless; `also`: causes besides theirs."""
     fault, code = run.fault, int(run.state.fault_drive_error)
     if fault is Fault.NONE:
-        # a reading that stands still shows no jump
-        stuck = any(event.kind is FaultKind.ENCODER_STUCK for event in events)
-        seen = [event for event in events if not (stuck and event.kind is FaultKind.ENCODER_JUMP)]
-        unnoticed = any(_not_noticed(run, event, period_s, start_ns) for event in seen)
+        unnoticed = any(_not_noticed(run, event, period_s, start_ns) for event in events if not _hidden(event, events))
         return ["the fault was not noticed"] if unnoticed else []
     if twin:
         return [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
