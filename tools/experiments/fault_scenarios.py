@@ -108,8 +108,8 @@ RPDO_DEADLINE = 0x8250  # EMCY of a drive whose RPDOs stay away
 _ALWAYS = (0.001, LONG_s)
 _STALE = frozenset({Fault.STALE_SAMPLE})
 _CLASSES = (
-    _lost(FaultKind.FRAMES_LOST, _STALE | {Fault.DRIVE_NOT_ENABLED}, certain=True),
-    _lost(FaultKind.SYNC_LOST, _STALE, certain=True),
+    _lost(FaultKind.FRAMES_LOST, MOTION | _STALE | {Fault.DRIVE_NOT_ENABLED}, certain=True),
+    _lost(FaultKind.SYNC_LOST, MOTION | _STALE, certain=True),
     _lost(
         FaultKind.RPDO_LOST, MOTION | _STALE | {Fault.DRIVE_NOT_ENABLED}, certain=False, harmless_s=0.01,
         emergency=RPDO_DEADLINE,
