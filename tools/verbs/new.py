@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import rmtree
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -16,7 +16,7 @@ import typer
 from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput, shipped_configurations
-from jointctl.tools.written_file import writing
+from jointctl.tools.written_file import replace_file, writing
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.urdf import UrdfJoint
@@ -88,22 +88,13 @@ def new(
         )
     if path.suffix != ".toml":
         raise DataError(f"{path}: the name of a configuration must end in .toml")
-    if path.exists():
-        raise DataError(f"{path}: exists already, a configuration is never overwritten")
+    _refuse_existing(path)
     with writing(path), TemporaryFile(dir=path.parent):  # before anything is asked
         pass
     if drive != NOBODY:
         with _nothing_written():
             text = filled(text, _from_drive(drive, text, path.parent, output, ask=not no_input))
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise DataError(f"{path}: exists already, a configuration is never overwritten") from None
-    except OSError as error:
-        with suppress(OSError):
-            path.unlink()  # half of it would count as a configuration of the user
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+    replace_file(path, text.encode(), lambda _: _refuse_existing(path))
     output.note(f"written: {path}, a copy of {source.name}")
     marked = text.count("FILL IN: ")
     if marked:
@@ -132,19 +123,22 @@ def _new_arm(folder: Path, output: Output) -> int:
     return 0
 
 
+def _refuse_existing(path: Path) -> None:
+    if os.path.lexists(path):
+        raise DataError(f"{path}: exists already, a configuration is never overwritten")
+
+
 def _write_folder(folder: Path, files: Mapping[str, bytes], output: Output) -> None:
+    """In one step: half of it would count as a configuration of the user."""
+    _refuse_existing(folder)
     with writing(folder):
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            raise DataError(f"{folder}: exists already, a configuration is never overwritten") from None
-    try:
-        for name, content in files.items():
-            with writing(folder):
-                (folder / name).write_bytes(content)
-    except DataError:
-        rmtree(folder, ignore_errors=True)  # half of it would count as a configuration of the user
-        raise
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder.parent, prefix=".arm.") as beside:
+            whole = Path(beside) / "whole"
+            whole.mkdir()  # the temporary one is for its owner alone
+            for name, content in files.items():
+                (whole / name).write_bytes(content)
+            whole.rename(folder)
     for name in files:
         output.note(f"written: {folder / name}")
 
@@ -153,8 +147,7 @@ def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, a
     """The files of an arm of one's own; what its URDF does not say is asked for, or has a default."""
     from jointctl.tools.inspection.first_files import ARM_FILE, first_arm, moving_joints, read_own_urdf
 
-    if folder.exists():
-        raise DataError(f"{folder}: exists already, a configuration is never overwritten")
+    _refuse_existing(folder)
     urdf = read_own_urdf(urdf_file)
     joints = moving_joints(urdf, [name.strip() for name in names.split(",")] if names else ())
     output.note(f"joints of {urdf_file.name}, in their order: {', '.join(joint.name for joint in joints)}")

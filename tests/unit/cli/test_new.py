@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import io
+import os
 import re
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 
@@ -122,17 +124,36 @@ def test_a_folder_that_is_not_there_is_refused_before_the_drive_is_asked(tmp_pat
         new(tmp_path / "none" / "mine.toml", output()[0], drive=DriveOptions("none", "none", None, 1))
 
 
-def test_nothing_is_left_of_a_file_for_which_the_disk_has_no_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def opened(path: Path, *_: str, **__: str) -> IO[str]:
-        path.touch()
-        return open("/dev/full", "w")
+FULL = OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "open", opened)
-    with pytest.raises(DataError, match="cannot be written: No space left"):
-        new(tmp_path / "mine.toml", output()[0])
+
+@pytest.mark.parametrize(("stop", "raised"), [(FULL, DataError), (KeyboardInterrupt(), KeyboardInterrupt)])
+@pytest.mark.parametrize("arm", [False, True])
+def test_nothing_is_left_of_files_whose_writing_ends_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arm: bool, stop: BaseException, raised: type[BaseException]
+) -> None:
+    def fsync(_: int) -> None:
+        raise stop
+
+    def write_bytes(path: Path, content: bytes) -> int:
+        path.touch()
+        if path.suffix == ".urdf":  # the second of the files
+            raise stop
+        return len(content)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    with pytest.raises(raised, match="cannot be written: No space left" if raised is DataError else None):
+        new(tmp_path / ("mine" if arm else "mine.toml"), output()[0], arm=arm)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_takes_the_place_of_a_link_that_leads_nowhere(tmp_path: Path) -> None:
+    for name, arm in (("mine.toml", False), ("mine", True)):
+        (tmp_path / name).symlink_to(tmp_path / "none")
+        with pytest.raises(DataError, match="exists already"):
+            new(tmp_path / name, output()[0], arm=arm)
+    assert not (tmp_path / "none").exists()
 
 
 class Inverting(SdoReader):
