@@ -101,6 +101,11 @@ class RunResult:
         return (self, *self.others)
 
     @property
+    def log_place(self) -> str:
+        """In words."""
+        return "lost" if self.log_lost else str(self.log_path)
+
+    @property
     def faulty(self) -> list[RunResult]:
         """The joints with a fault, the one that had it first before those that its stop has reached."""
         return sorted((joint for joint in self.joints if joint.fault_text), key=lambda joint: joint.fault_slot_ns)
@@ -176,7 +181,7 @@ def _table(result: RunResult) -> Table:
         table.title = f"Run of {result.name}"
     table.add_row(*result.load_row)
     table.add_row("drive afterwards", result.drive_state)
-    table.add_row("log", "lost" if result.log_lost else str(result.log_path))
+    table.add_row("log", result.log_place)
     return table
 
 

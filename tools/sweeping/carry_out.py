@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, DataError, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, TrajectoryKind
@@ -447,6 +447,8 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; no {what}")
         return INTERRUPTED
+    if result.log_lost:
+        raise DataError(f"{result.log_path}: this log is lost; no {what}")
     return result
 
 

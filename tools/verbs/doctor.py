@@ -126,5 +126,5 @@ def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool,
     counts = result.report.counts_per_motor_turn
     found = [judged(config, counts)] if counts else []
     found += motion_findings(config, plan, result.records, result.fault, result.fault_text)
-    output.note(f"  drive afterwards: {result.drive_state}; log: {result.log_path}")
+    output.note(f"  drive afterwards: {result.drive_state}; log: {result.log_place}")
     return report_findings(found, output, "Motion")

@@ -161,7 +161,7 @@ class _Runs:
             self.code = error.exit_code
             self.tell("ended", [error.message, error.hint])
             return self._ended
-        lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
+        lines = [f"log      {result.log_place}", f"drive    {result.drive_state}"]
         if result.summary.error is not None:
             lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
         if result.stopped_by:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -25,6 +26,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, WARNING, Event
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session import result as run_report
+from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import OVERRUN_CYCLES, EventFinder, PhaseLines
 from jointctl.tools.session.elmo_drive import serial_fault_text
@@ -40,6 +42,9 @@ from jointctl.tools.session.fault_words import (
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.run_watch import RunWatch
 from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.sweeping import carry_out
+from jointctl.tools.verbs import scope as scope_module
+from jointctl.tools.verbs.doctor import doctor_motion
 from tests.configurations import changed
 from tests.run_records import START_NS, WORDS, eventful_records, run_records
 
@@ -399,6 +404,25 @@ def test_a_log_that_is_lost_has_an_exit_code_and_no_picture(tmp_path: Path, monk
         found = replace(result(tmp_path, fault), log_lost=True)
         assert run_report.report_run(found, Output(json=True, stdout=out, stderr=io.StringIO()), CONFIG) == code
         assert json.loads(out.getvalue())["log"] is None
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_no_verb_names_a_log_that_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost: bool) -> None:
+    found, out, err = replace(result(tmp_path, Fault.NONE), log_lost=lost), io.StringIO(), io.StringIO()
+    for module in (session_module, carry_out):
+        monkeypatch.setattr(module, "Session", lambda *_: SimpleNamespace(run=lambda: found, drive_state="off"))
+    config = changed(CONFIG, log__folder=tmp_path)
+    output = Output(stdout=out, stderr=err)
+    doctor_motion(config, output, assume_yes=True)
+    assert (f"log: {tmp_path / 'run.mcap'}" in err.getvalue()) is not lost
+    plan: Any = SimpleNamespace(config=config)
+    with pytest.raises(DataError, match="lost; no map") if lost else contextlib.nullcontext():
+        assert carry_out.carried_out(plan, output, "map", assume_yes=True, dry_run=False) is found
+    feed: Any = SimpleNamespace(settings=lambda *_: None, forget=lambda: None, stop_request=lambda: None)
+    runs = scope_module._Runs(config, output, feed, "title", allow_low_margin=False)
+    runs.one()
+    assert runs.last_end["stage"] == "ended"
+    assert f"log      {'lost' if lost else tmp_path / 'run.mcap'}" in runs.last_end["lines"]
 
 
 def reported_to_a_full_disk(found: RunResult) -> int:
