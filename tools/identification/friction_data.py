@@ -22,7 +22,8 @@ recognised).  Every problem is one `DataError` that names file, line and value.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,40 @@ def check_given(given: ForeignFormat) -> None:
             raise UsageError(f"--counts-per-turn is missing: a unit (={unit}) needs it")
 
 
+def refuse_unused(given: Mapping[str, object], usual: Mapping[str, object], used: Container[str], kind: str) -> None:
+    """`UsageError` names an option that was given, by its field, and would not be looked at with data of this kind."""
+    for name, value in given.items():
+        if name not in used and value != usual[name]:
+            flag = "--" + re.sub(r"_(radps2?|Hz|NmpA|Nm)$", "", name).replace("_", "-")
+            raise UsageError(f"{flag} does not apply to {kind}", "leave it away")
+
+
+_COLUMNS_OF_MOTION = ("position", "load", "temperature")
+
+
+def refuse_unused_format(given: ForeignFormat, *, timed: bool) -> None:
+    """`UsageError` names what was given of a table's columns, and is of a column that is none of them."""
+    there = {
+        name: getattr(given, f"{name}_column") is not None
+        for name in ("velocity", "torque", "current", "position", "load", "temperature", "time")
+    }
+    used = {"velocity_column", "torque_column", "current_column", "ratio", "delimiter", "where", "side", "torque_side"}
+    used |= {f"{name}_unit" for name, given_too in there.items() if given_too}
+    if timed:
+        used |= {"time_column", "sample_rate_Hz", "motion_column", *(f"{name}_column" for name in _COLUMNS_OF_MOTION)}
+        used |= {"position_side"} if there["position"] else set()
+    if there["current"] or not timed:
+        used.add("torque_constant_NmpA")  # of plateaus it is compared with the configuration's besides
+    units = [unit for unit in ("velocity_unit", "position_unit") if unit in used]
+    if any(str(getattr(given, unit)).startswith("count") for unit in units):
+        used.add("counts_per_turn")
+    signed = {*(name for name in ("position", "velocity", "load") if there[name]), "torque"}
+    if signed.issuperset(given.reverse):
+        used.add("reverse")
+    what = "a motion in time" if timed else "plateaus"
+    refuse_unused(vars(given), vars(ForeignFormat()), used, f"{what} with the columns that were given")
+
+
 def require_stated(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
     """`UsageError` where what a table does not tell was not given: the torque's column, and each (flag, value)."""
     if not (given.torque_column or given.current_column):
@@ -324,6 +359,7 @@ def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
     stated = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
     require_stated(table, given, stated)
     require_units_of_heading(table, given)
+    refuse_unused_format(given, timed=False)
     assert given.ratio is not None
     table = chosen_lines(table, given)
     velocity, torque = velocity_radps(table, given), motor_torque_Nm(table, given)
@@ -389,10 +425,8 @@ def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, floa
 
 def read_sweep(table: TableFile, given: ForeignFormat) -> FrictionData:
     """Points of a sweep and the constants of its sidecar (or `--ratio`); `DataError` where they contradict."""
-    for flag, value in (("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--torque-side",
-                        given.torque_side), ("--torque-constant", given.torque_constant_NmpA)):  # fmt: skip
-        if value is not None:
-            raise UsageError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
+    told = "a sweep file, which tells its own columns and units"
+    refuse_unused(vars(given), vars(ForeignFormat()), ("ratio", "delimiter"), told)
     if not table.ended:
         # the sweep ends every line, so this one may have lost digits
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")

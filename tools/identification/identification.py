@@ -31,7 +31,7 @@ from jointctl.tools.identification.fit import (
     with_form,
     with_noise,
 )
-from jointctl.tools.identification.friction_data import FrictionData, relative_figures
+from jointctl.tools.identification.friction_data import FrictionData, refuse_unused, relative_figures
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
@@ -42,6 +42,11 @@ from jointctl.tools.identification.swarm import SwarmResult, SwarmSettings, run_
 SLOWEST_degps, FASTEST_degps = 1e-4, 6e4
 STATIC_MAX_Nm = 1e3  # at the motor
 MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
+_CUBIC_STAGE = {"continuous", "search_knee", "knee_radps"}
+_UNUSED = {
+    "stribeck": _CUBIC_STAGE,
+    "coulomb-viscous": {*_CUBIC_STAGE, "ws_min_radps", "ws_max_radps", "static_max_Nm"},
+}
 
 
 @dataclass(frozen=True)
@@ -60,8 +65,13 @@ class Options:
     swarm: SwarmSettings = field(default_factory=SwarmSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)  # of a time series, whose model is always chosen
 
+    def given(self) -> dict[str, object]:
+        """All by name, those of the swarm and of a motion too."""
+        every = {**vars(self), **vars(self.swarm), **vars(self.motion)}
+        return {name: value for name, value in every.items() if name not in ("swarm", "motion")}
+
     def check(self) -> None:
-        """Raise `UsageError` for a value out of range."""
+        """Raise `UsageError` for a value out of range, and for one that the chosen model does not look at."""
         s = self.swarm
         for name, value, low, high in (
             ("--outlier-threshold", self.outlier_threshold, 0.0, 100.0), ("--folds", self.folds, 2, 100),
@@ -83,6 +93,9 @@ class Options:
             raise UsageError(f"--static-max (={self.static_max_Nm:g} Nm) must be in (0..{STATIC_MAX_Nm:g}]")
         if self.model not in MODELS:
             raise UsageError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
+        if unused := _UNUSED.get(self.model):
+            given = self.given()
+            refuse_unused(given, Options().given(), given.keys() - unused, f"--model {self.model}")
 
 
 # --- what was found, of both directions ---
@@ -279,6 +292,8 @@ def identify_friction(
     Raises `UsageError` for options out of range, `DataError` where the data or the result are not believable.
     """
     options.check()
+    usual = Options().given()
+    refuse_unused(options.given(), usual, usual.keys() - vars(options.motion), f"{data.path}, which holds plateaus")
     before = check_data(data, limits)
     _refuse(data, before.problems)
     notes, warnings = list(data.notes), list(before.warnings)

@@ -29,6 +29,7 @@ from jointctl.tools.identification.friction_data import (
     ForeignFormat,
     check_given,
     read_sidecar,
+    refuse_unused,
 )
 from jointctl.tools.identification.tables import read_table
 
@@ -211,6 +212,7 @@ def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
     table = read_table(path)
     if not {"load_Nm", "velocity_radps", "motor_torque_Nm", "temperature_degC"} <= set(table.columns):
         return None
+    refuse_unused(vars(given), vars(ForeignFormat()), (), "a sweep file, which tells its own columns and units")
     ratio = float(read_sidecar(path)["reduction_ratio"])
     settled = table.numbers("settled") == 1.0
     notes = [f"{np.count_nonzero(~settled)} points never settled: not used"] if not settled.all() else []

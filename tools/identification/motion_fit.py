@@ -554,6 +554,8 @@ def identify_motion(
     motion: Motion, settings: MotionSettings, *, knee_radps: float = 40.0 * DEGREE, seed: int = 1
 ) -> MotionFit:
     """Model, parameters, intervals, held-out error; `DataError` where the result is not friction."""
+    if motion.plateaus:
+        settings = replace(settings, speed_min_radps=0.5 * float(abs(motion.velocity_radps).min()))
     used = motion.used(settings)
     ground = _ground(motion, used)
     block, blocks = _blocks(motion, used, ground.words)

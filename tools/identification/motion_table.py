@@ -23,6 +23,7 @@ from jointctl.tools.identification.friction_data import (
     check_given,
     chosen_lines,
     motor_torque_Nm,
+    refuse_unused_format,
     require_stated,
     require_units_of_heading,
     velocity_radps,
@@ -161,4 +162,5 @@ def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
     needed += [("--position-unit", given.position_unit)] if given.position_column else []
     needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
     require_stated(table, given, needed)
+    refuse_unused_format(given, timed=True)
     require_units_of_heading(table, given)

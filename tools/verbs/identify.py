@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path, configuration_files, configurations
 
@@ -266,8 +266,6 @@ def identify(
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
     in_time = is_series(data_path, given)
-    if options.motion.also and not in_time:
-        raise UsageError(f"--also (={options.motion.also[0]}) is for motions, and {data_path} holds plateaus")
     regressed = in_time or motion_of_plateaus(data_path, given or ForeignFormat()) is not None
     from_data = _from_motion if regressed else _from_plateaus
     found = from_data(data_path, given, options, limits, output)
@@ -348,7 +346,9 @@ def _from_plateaus(
 
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
     """The motion of a run log or of a table, with those of `settings.also` after it."""
+    from jointctl.tools.identification.friction_data import ForeignFormat, refuse_unused
     from jointctl.tools.identification.motion_data import (
+        MotionSettings,
         is_series,
         joined,
         motion_of_log,
@@ -369,28 +369,34 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
             )
         return read_motion(path, given, settings)
 
-    plateaus = motion_of_plateaus(path, given)
-    return plateaus or joined([one(each) for each in (path, *settings.also)])
+    if plateaus := motion_of_plateaus(path, given):
+        refuse_unused(vars(settings), vars(MotionSettings()), (), f"{path}, which holds plateaus")
+        return plateaus
+    paths = (path, *settings.also)
+    if all(each.suffix.lower() == ".mcap" for each in paths):
+        refuse_unused(vars(given), vars(ForeignFormat()), ("ratio",), "a run log, which tells its own columns")
+    return joined([one(each) for each in paths])
 
 
 def _from_motion(
     path: Path, given: ForeignFormat | None, options: Options, limits: JointLimits | None, output: Output
 ) -> _Found:
     from jointctl.tools.identification import motion_report as reports
-    from jointctl.tools.identification.friction_data import ForeignFormat
+    from jointctl.tools.identification.friction_data import ForeignFormat, refuse_unused
+    from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.motion_fit import identify_motion
     from jointctl.tools.identification.plausibility import Verdict, check_motion
     from jointctl.tools.recording.report_page import Section, from_terminal
     from jointctl.tools.recording.report_page import remarks as notes_of
 
+    options.check()
+    used = {"knee_radps", "seed", *vars(options.motion)}
+    refuse_unused(options.given(), Options().given(), used, f"{path}, which holds motions")
     motion = motion_from(path, given or ForeignFormat(), options.motion)
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
     if verdict.problems:
         raise DataError(f"{path}: {'; '.join(verdict.problems)}")
-    settings = options.motion
-    if motion.plateaus:
-        settings = replace(settings, speed_min_radps=0.5 * float(abs(motion.velocity_radps).min()))
-    found = identify_motion(motion, settings, knee_radps=options.knee_radps, seed=options.swarm.seed)
+    found = identify_motion(motion, options.motion, knee_radps=options.knee_radps, seed=options.swarm.seed)
     section = reports.motion_section(found)
     warnings = list(verdict.warnings)
     if len(found.model.directions) == 1:

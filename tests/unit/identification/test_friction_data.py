@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -257,8 +258,45 @@ def test_a_table_without_mapping_lists_its_columns(tmp_path):
 
 
 def test_unit_flags_do_not_go_with_a_sweep_file(tmp_path):
-    with pytest.raises(UsageError, match="a sweep file tells its own units"):
-        read_friction_data(write_sweep(tmp_path, rows()), ForeignFormat(velocity_unit="deg/s"))
+    for change, flag in (
+        ({"velocity_unit": "deg/s"}, "--velocity-unit"),
+        ({"where": ("pass=0",)}, "--where"),
+        ({"torque_unit": "mNm"}, "--torque-unit"),
+        ({"reverse": ("torque",)}, "--reverse"),
+        ({"counts_per_turn": 4096.0}, "--counts-per-turn"),
+    ):
+        with pytest.raises(UsageError, match=f"{flag} does not apply to a sweep file"):
+            read_friction_data(write_sweep(tmp_path, rows()), ForeignFormat(**change))
+    read_friction_data(write_sweep(tmp_path, rows()), ForeignFormat(velocity_column=None, time_unit="s"))
+
+
+@pytest.mark.parametrize(
+    ("change", "flag"),
+    [
+        ({"position_column": "speed"}, "--position-column"),
+        ({"position_unit": "deg"}, "--position-unit"),
+        ({"load_column": "speed"}, "--load-column"),
+        ({"temperature_unit": "K"}, "--temperature-unit"),
+        ({"motion_column": "speed"}, "--motion-column"),
+        ({"current_unit": "mA"}, "--current-unit"),
+        ({"counts_per_turn": 4096.0}, "--counts-per-turn"),
+        ({"reverse": ("load",)}, "--reverse"),
+        ({"time_unit": "ms"}, "--time-unit"),
+    ],
+)
+def test_what_a_table_of_plateaus_has_no_column_for_is_refused(tmp_path, change, flag):
+    path = write_foreign(tmp_path, "speed,torque\n" + "".join(f"{0.1 * k},{k}\n" for k in range(-20, 21) if k))
+    given = ForeignFormat(
+        velocity_column="speed",
+        torque_column="torque",
+        velocity_unit="rad/s",
+        side="joint",
+        torque_side="joint",
+        ratio=50,
+    )
+    read_friction_data(path, given)
+    with pytest.raises(UsageError, match=f"{flag} does not apply to plateaus"):
+        read_friction_data(path, replace(given, **change))
 
 
 # --- Torques next to zero, and numbers beyond all measure, in a table of friction: a result or one line ---

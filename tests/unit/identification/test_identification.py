@@ -13,6 +13,7 @@ from jointctl.tools.identification.fit import make_problem, project
 from jointctl.tools.identification.identification import Options, identify_friction
 from jointctl.tools.identification.identification_report import left_out_text
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE
+from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
 from jointctl.tools.identification.swarm import SwarmSettings
 from tests.unit.identification.synthetic_friction import LIMITS, QUICK, DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
@@ -197,6 +198,22 @@ def test_a_knee_with_too_few_points_on_one_side_is_refused(knee_degps, fits):
 def test_options_out_of_range_are_refused(change, message):
     with pytest.raises(UsageError, match=message):
         identify_friction(paper_data(0), Options(**change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model": "stribeck", "search_knee": True}, "--search-knee does not apply to --model stribeck"),
+        ({"model": "stribeck", "knee_radps": 1.0}, "--knee does not apply to --model stribeck"),
+        ({"model": "coulomb-viscous", "ws_max_radps": 0.1}, "--ws-max does not apply to --model coulomb-viscous"),
+        ({"model": "coulomb-viscous", "static_max_Nm": 0.1}, "--static-max does not apply to --model"),
+        ({"motion": MotionSettings(band_Hz=10.0)}, "--band does not apply to .*, which holds plateaus"),
+        ({"motion": MotionSettings(mean_samples=3)}, "--mean-samples does not apply to .*, which holds plateaus"),
+    ],
+)
+def test_options_that_nothing_would_look_at_are_refused(change, message):
+    with pytest.raises(UsageError, match=message):
+        identify_friction(paper_data(0), Options(swarm=QUICK.swarm, **change))
 
 
 @pytest.mark.parametrize("change", [{"static_max_Nm": 0.2}, {"static_max_Nm": 1e3}, {"ws_min_radps": 19.9 * DEGREE}])

@@ -31,6 +31,7 @@ from jointctl.tools.identification.motion_report import (
 )
 from jointctl.tools.identification.motion_table import read_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.sweeping.carry_out import MeasuredPoint, PlateauResult
 from jointctl.tools.sweeping.data_file import SweepFile
@@ -198,8 +199,26 @@ def test_a_further_file_must_be_a_motion(tmp_path):
     with pytest.raises(DataError, match=r"x\.csv: is no motion in time"):
         motion_from(log, ForeignFormat(), replace(SETTINGS, also=(tmp_path / "x.csv",)))
     sweep = plateaus(tmp_path / "s.csv", TrueJoint())
-    with pytest.raises(UsageError, match=r"--also \(=.*move.csv\) is for motions"):
+    with pytest.raises(UsageError, match=r"--also does not apply to .*s\.csv, which holds plateaus"):
         identify(sweep, output(), options=Options(motion=replace(SETTINGS, also=(data,))))
+
+
+def test_options_that_a_motion_has_no_use_for_are_refused(tmp_path):
+    data = run_log(tmp_path / "run.mcap", motion_columns(seconds=10.0))
+    for change, flag in (
+        ({"model": "stribeck"}, "--model"),
+        ({"folds": 3}, "--folds"),
+        ({"ws_max_radps": 0.1}, "--ws-max"),
+    ):
+        with pytest.raises(UsageError, match=rf"{flag} does not apply to .*run\.mcap, which holds motions"):
+            identify(data, output(), options=Options(**change))
+    with pytest.raises(UsageError, match=r"--seed \(=-1\) must be in"):
+        identify(data, output(), options=Options(swarm=SwarmSettings(seed=-1)))
+    for given in (ForeignFormat(side="motor"), ForeignFormat(where=("a=1",)), ForeignFormat(velocity_column="v")):
+        with pytest.raises(UsageError, match="does not apply to a run log"):
+            motion_from(data, given, SETTINGS)
+    with pytest.raises(UsageError, match="--temperature-unit does not apply to a motion in time with the columns"):
+        read(tmp_path / "a.csv", motion_columns(seconds=10.0), temperature_unit="K")
 
 
 def test_single_wild_samples_do_not_move_the_result(folder):
