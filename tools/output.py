@@ -10,6 +10,7 @@ import json as json_format
 import math
 import os
 import re
+import shlex
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
@@ -231,6 +232,11 @@ def _plain(value: object) -> Any:
     return value
 
 
+def command_line(*words: object) -> str:
+    """A command of jointctl to be copied: quoted where a path has blanks."""
+    return shlex.join(["jointctl", *map(str, words)])
+
+
 # --- tables on a narrow terminal: no number is broken in its middle, and rows become lists ---
 
 
@@ -314,11 +320,11 @@ def _listed(table: Table, width: int) -> Group:
 
 
 def _lines(texts: list[str], width: int) -> list[str]:
-    """As many as fit on a line; what is longer than a line has one of its own."""
+    """As many as fit on a line; what is longer than a line begins one of its own."""
     lines: list[str] = []
     for text in texts:
         if lines and len(lines[-1]) + 2 + len(text) <= width:
             lines[-1] += f", {text}"
         else:
-            lines.append(text)
+            lines += textwrap.wrap(text, max(width, 1), break_on_hyphens=False)
     return lines

@@ -301,7 +301,7 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
         )
     terms |= _orders_told(motion, used, both=len(words) == 2)
     if motion.temperature_degC is None:
-        untold.append("temperature: no column of it: give --temperature-column, and warm up by 15 K")
+        untold.append("temperature: not in these data: let it warm up by 15 K (of a table: --temperature-column)")
     else:
         spread = float(np.ptp(motion.temperature_degC[used]))
         if spread >= _LEAST_WARMING_K:
@@ -517,7 +517,7 @@ def _untold(model: Model, motion: Motion, parameters: dict[str, Parameter]) -> l
     if motion.load_Nm is None:
         found.append(
             f"{motion.torque_name}: its scale (the torque constant) stays unknown without a known load: all torques, "
-            "the inertia and gravity scale with it: attach a known mass, or give --load-column"
+            "the inertia and gravity scale with it: attach a known mass (of a table: --load-column)"
         )
     if not model.form.stribeck:
         found.append("Stribeck effect: not found above --speed-min: move more slowly")

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import UsageError
-from jointctl.tools.output import Output
+from jointctl.tools.output import Output, command_line
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
@@ -79,7 +79,9 @@ def excite(
     found = ExciteResult(str(log), 0.8 * design.slowest_radps, design.condition, design.known, design.untold)
     table = Table(title="Excitation", title_justify="left", show_header=False)
     table.add_row("log", str(log))
-    table.add_row("next", f"jointctl identify {log} --speed-min {found.speed_min_radps:.3g} --into CONFIG")
+    table.add_row(
+        "next", command_line("identify", log, "--speed-min", f"{found.speed_min_radps:.3g}", "--into", "CONFIG")
+    )
     output.result(table, vars(found), found)
     return 0
 

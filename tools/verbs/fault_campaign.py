@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jointctl.drivers.errors import INTERRUPTED, UsageError
-from jointctl.tools.output import Output
+from jointctl.tools.output import Output, command_line
 from jointctl.tools.verbs.study import ManyRuns
 from jointctl.tools.verbs.verb_options import ConfigPath, Report, VerbOutput, loaded_joint_or_arm
 
@@ -136,7 +136,7 @@ def fault_campaign(
     if found:
         output.error(
             f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
-            f"replay one with: jointctl fault-campaign {config.path}{'' if during == 'run' else f' --{during}'}"
+            f"replay one with: {command_line('fault-campaign', config.path)}{'' if during == 'run' else f' --{during}'}"
             f"{' --pairs' if drawn.pairs else ''} --seed {seed} --scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS

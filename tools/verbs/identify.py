@@ -393,6 +393,7 @@ def _from_motion(
     used = {"knee_radps", "seed", *vars(options.motion)}
     refuse_unused(options.given(), Options().given(), used, f"{path}, which holds motions")
     motion = motion_from(path, given or ForeignFormat(), options.motion)
+    output.note(f"fitting {len(motion.time_s)} samples, which takes some seconds")
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
     if verdict.problems:
         raise DataError(f"{path}: {'; '.join(verdict.problems)}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
-from jointctl.tools.output import Output
+from jointctl.tools.output import Output, command_line
 from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput, shipped_configurations
 from jointctl.tools.written_file import replace_file, writing
 
@@ -98,9 +98,9 @@ def new(
     output.note(f"written: {path}, a copy of {source.name}")
     marked = text.count("FILL IN: ")
     if marked:
-        output.note(f"next: fill in the {marked} values marked FILL IN, then jointctl doctor {path}")
+        output.note(f"next: fill in the {marked} values marked FILL IN, then {command_line('doctor', path)}")
     elif drive != NOBODY:
-        output.note(f"next: jointctl doctor {path}, then jointctl run {path} --dry-run")
+        output.note(f"next: {command_line('doctor', path)}, then {command_line('run', path, '--dry-run')}")
     return 0
 
 
@@ -119,7 +119,7 @@ def _new_arm(folder: Path, output: Output) -> int:
 
     sources = [one for one in sorted(SHIPPED_ARM.parent.iterdir()) if one.suffix in (".toml", ".urdf")]
     _write_folder(folder, {source.name: source.read_bytes() for source in sources}, output)
-    output.note(f"next: jointctl check {folder / SHIPPED_ARM.name}; for an arm of your own give --urdf FILE")
+    output.note(f"next: {command_line('check', folder / SHIPPED_ARM.name)}; for an arm of your own give --urdf FILE")
     return 0
 
 
@@ -163,7 +163,7 @@ def _arm_of_urdf(folder: Path, urdf_file: Path, names: str, output: Output, *, a
     arm_file = folder / ARM_FILE
     output.note("drives, encoders and friction are the shipped shoulder's, scaled to each effort, on a virtual bus")
     output.note(
-        f"next: jointctl check {arm_file}, hil and run; then put the values of your drives in its joints' files"
+        f"next: {command_line('check', arm_file)}, hil and run; then put the values of your drives in its joints' files"
     )
     return 0
 

@@ -20,6 +20,7 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, read_text, shipped_config
 from jointctl.tools.inspection.first_files import checked, eds_of_identity, filled, first_values, marks
 from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
+from jointctl.tools.output import Output
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.device_on_bus import DeviceOnBus
 from tests.eds_styles import GOLD, NANOTEC, eds_text
@@ -146,6 +147,16 @@ def test_nothing_is_left_of_files_whose_writing_ends_early(
     with pytest.raises(raised, match="cannot be written: No space left" if raised is DataError else None):
         new(tmp_path / ("mine" if arm else "mine.toml"), output()[0], arm=arm)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_next_command_can_be_copied_where_a_folder_has_blanks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new(tmp_path / "my arm", Output(), arm=True)
+    new(tmp_path / "my joint.toml", Output())
+    said = capsys.readouterr().err
+    assert f"jointctl check '{tmp_path / 'my arm' / 'arm.toml'}'" in said
+    assert f"jointctl doctor '{tmp_path / 'my joint.toml'}'" in said
 
 
 def test_nothing_takes_the_place_of_a_link_that_leads_nowhere(tmp_path: Path) -> None:

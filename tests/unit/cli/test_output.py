@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -27,7 +28,7 @@ from jointctl.tools.drawing import save_png
 from jointctl.tools.experiments.campaign import write_json
 from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, StudySettings, write_csv
 from jointctl.tools.experiments.scenarios import ErrorFigures
-from jointctl.tools.output import Output, width_of
+from jointctl.tools.output import Output, command_line, width_of
 from jointctl.tools.recording.report_page import Details, Paragraph, Section, draw, page
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.recording.run_log import INFO, Event
@@ -214,6 +215,23 @@ def test_a_table_that_a_narrow_terminal_shows_as_a_list(monkeypatch: pytest.Monk
     output.result(made)
     assert "\x1b[2J" not in out.getvalue()
     assert "\x9b" not in out.getvalue()
+
+
+def test_a_list_on_a_narrow_terminal_cuts_nothing_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    words = [f"word{k}" for k in range(20)]
+    made = Table("first heading", "a second heading", "a third heading")
+    made.add_row("row", "1", " ".join(words))
+    output, out, _ = output_to()
+    output.result(made)
+    assert [word for word in out.getvalue().split() if word in words] == words
+    assert max(map(len, out.getvalue().splitlines())) <= 40
+
+
+@pytest.mark.parametrize(("path", "shown"), [("my arm/ö.toml", "'my arm/ö.toml'"), ("runs/a.mcap", "runs/a.mcap")])
+def test_a_command_to_be_copied_is_one_of_a_shell(path: str, shown: str) -> None:
+    assert command_line("doctor", Path(path)) == f"jointctl doctor {shown}"
+    assert shlex.split(command_line("run", path, "--dry-run")) == ["jointctl", "run", path, "--dry-run"]
 
 
 def test_json_stays_json_and_toml_stays_toml() -> None:
