@@ -183,6 +183,22 @@ def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monke
     assert str(raised.value).startswith(f"direction: one\nother; {path} is as it was")
 
 
+@pytest.mark.parametrize("step", ["direction", "response"])
+def test_an_interruption_offers_to_go_on_only_where_a_step_was_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    def interrupted(_: Tune) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tune, "_step_direction", lambda _: [])
+    monkeypatch.setattr(Tune, f"_step_{step}", interrupted)
+    path = written(tmp_path / "joint.toml", "precise")
+    output, _, err = outputs()
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True)) == 130
+    assert ("--resume goes on" in err.getvalue()) == (tmp_path / "joint.tune" / "steps.json").exists()
+    assert ("no step was done" in err.getvalue()) == (step == "direction")
+
+
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:
     path = written(tmp_path / "soft.toml", "realistic")
     output, out, _ = outputs()

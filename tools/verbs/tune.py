@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
+
+if TYPE_CHECKING:
+    from jointctl.tools.verbs.tune_steps import Tune
 
 LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders", "link_encoder"), ("tracking", "settling", "quiet")
 
@@ -80,9 +83,14 @@ def tune(
         except NotCarriedOut as ended:
             if not ended.stopped_by:
                 return never_begun(ended.drive_state, output, dry_run=dry_run)
-            output.note(f"stopped by {ended.stopped_by}; {config.path} is as it was; --resume goes on")
+            output.note(f"stopped by {ended.stopped_by}; {_kept(job)}")
         except KeyboardInterrupt:
             by = carrier.control.signals.by_command if carrier.control is not None else ""
-            output.note(f"interrupted{by}; nothing moves any more; {config.path} is as it was; --resume goes on")
+            output.note(f"interrupted{by}; nothing moves any more; {_kept(job)}")
         require_off(carrier.drive_state)
         return INTERRUPTED
+
+
+def _kept(job: Tune) -> str:
+    """After an interruption."""
+    return f"{job.original.path} is as it was; {'--resume goes on' if job.state else 'no step was done'}"
