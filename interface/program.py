@@ -140,9 +140,12 @@ def motor_of(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted,
     if lockstep:
         if options.foxglove is not None or options.ros2 is not None:
             raise UsageError("lockstep=True is simulated time: nothing of it can be watched with foxglove or ros2")
+        from jointctl.firmware_py.slow_start import slow_start
         from jointctl.lockstep_joint import LockstepMotor
+        from jointctl.tools.output import Output
 
-        return LockstepMotor(axes_of(source.config))
+        with slow_start(Output().note, kind):
+            return LockstepMotor(axes_of(source.config))
     from jointctl.live_joint import LiveMotor
 
     return LiveMotor(source, asked_ns, options, allow_low_margin=wanted.allow_low_margin)

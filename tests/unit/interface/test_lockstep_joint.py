@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -11,6 +13,9 @@ import numpy.typing as npt
 import pytest
 
 import jointctl
+from jointctl import lockstep_joint
+from jointctl.firmware_py import slow_start
+from jointctl.firmware_py.slow_start import compiling
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.joint import Joint, SetPointError
 
@@ -324,3 +329,24 @@ def test_without_enable_nothing_is_followed() -> None:
 def test_what_is_no_argument_of_a_joint_is_named(given: dict[str, Any], words: str) -> None:
     with pytest.raises(jointctl.JointctlError, match=words):
         Joint("virtual", lockstep=True, **given)
+
+
+def test_the_first_joint_says_that_it_compiles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = lockstep_joint.LockstepMotor
+
+    def compiled(axes: Any) -> Any:
+        with compiling():
+            time.sleep(0.2)
+        return made(axes)
+
+    monkeypatch.setattr(lockstep_joint, "LockstepMotor", compiled)
+    monkeypatch.setattr(slow_start, "slow_start", functools.partial(slow_start.slow_start, after_s=0.0))
+    with Joint("virtual", lockstep=True):
+        pass
+    assert capsys.readouterr() == ("", "Joint: compiling, which only the first start does\n")
+    monkeypatch.setattr(lockstep_joint, "LockstepMotor", made)
+    with Joint("virtual", lockstep=True):
+        pass
+    assert capsys.readouterr() == ("", "")
