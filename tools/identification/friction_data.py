@@ -469,6 +469,8 @@ def read_friction_data(path: str | Path, given: ForeignFormat | None = None, *, 
     for flag, of_time in (("--time-column", given.time_column), ("--sample-rate", given.sample_rate_Hz)):
         if of_time is not None:
             raise UsageError(f"{flag} (={of_time}) is for time series, which only `identify` reads")
+    if path.suffix.lower() == ".mcap":
+        raise UsageError(f"{path}: is a run log, and plateaus of constant speed are needed", "`sweep` measures them")
     table = read_table(path, given.delimiter)
     ours = not given.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
     if ours:

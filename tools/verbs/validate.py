@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools.verbs.identify import Data, GivenFormat, joint_limits
+from jointctl.tools.verbs.identify import GivenFormat, joint_limits
 from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def validate(
             metavar="CONFIG", help="configuration with the identified friction section", autocompletion=configurations
         ),
     ],
-    data_path: Data,
+    data_path: Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus")],
     output: VerbOutput,
     *,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write")] = None,

@@ -270,6 +270,12 @@ def test_unit_flags_do_not_go_with_a_sweep_file(tmp_path):
     read_friction_data(write_sweep(tmp_path, rows()), ForeignFormat(velocity_column=None, time_unit="s"))
 
 
+def test_a_run_log_is_no_table_of_plateaus(tmp_path):
+    with pytest.raises(UsageError, match=r"run\.mcap: is a run log") as caught:
+        read_friction_data(tmp_path / "run.mcap")
+    assert "sweep" in caught.value.hint
+
+
 @pytest.mark.parametrize(
     ("change", "flag"),
     [
