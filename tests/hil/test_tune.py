@@ -181,6 +181,7 @@ def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monke
     with pytest.raises(ConfigurationProblems) as raised:
         tune(load_config(path), output, options=TuneOptions(lockstep=True))
     assert str(raised.value).startswith(f"direction: one\nother; {path} is as it was")
+    assert "has the steps before" not in str(raised.value)
 
 
 @pytest.mark.parametrize("step", ["direction", "response"])

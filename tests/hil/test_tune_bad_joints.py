@@ -69,6 +69,7 @@ def ended(path: Path, carrier: Watched, text: str) -> tuple[str, dict[str, Any]]
     assert path.read_text() == text
     assert carrier.drive_state in OFF
     kept = folder / "steps.json"
+    assert ("has the steps before" in line) == kept.exists()
     return line, json.loads(kept.read_text()) if kept.exists() else {}
 
 

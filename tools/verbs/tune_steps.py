@@ -195,7 +195,8 @@ class Tune:
                     self._save()
                 getattr(self, f"_take_{name}", lambda _: None)(self.state[name])
             except JointctlError as error:
-                kept = f"{self.original.path} is as it was, {self.folder} has the steps before"
+                kept = f"{self.original.path} is as it was"
+                kept += f", {self.folder} has the steps before" if self.state else ""
                 seen = error.message.removeprefix(f"{name}: ")
                 error.message = f"{name}: {seen}; {one_line(kept)}"
                 raise
