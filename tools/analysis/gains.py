@@ -116,6 +116,7 @@ class Law:
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
+    sensitivity: float = SENSITIVITY
     encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
 
     def beyond(self, settings: LoopSettings) -> float:
@@ -165,7 +166,7 @@ LAWS = {
     "two_encoders": Law(
         "two_encoders", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
-        most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.BOTH,
+        most_noise_Nm=LARGEST_NOISE_Nm, sensitivity=2.4, encoders=Encoders.BOTH,  # 2 is far softer where much is late
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -176,7 +177,7 @@ LAWS = {
 _FLEXIBLE = {  # by what the law of a flexible joint reads
     Encoders.BOTH: LAWS["two_encoders"],
     Encoders.LINK: LAWS["link_encoder"],
-    Encoders.MOTOR: replace(LAWS["two_encoders"], name="motor_encoder", encoders=Encoders.MOTOR),
+    Encoders.MOTOR: replace(LAWS["two_encoders"], name="motor_encoder", sensitivity=2.0, encoders=Encoders.MOTOR),
 }
 
 
@@ -469,7 +470,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     from scipy.optimize import minimize  # here: only a search waits for it
 
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
-    ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY), STICKY, strict=True)
+    ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s, *wanted)
     search = _Search(config, law, intervals, settings)
