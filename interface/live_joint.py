@@ -120,6 +120,7 @@ class LiveMotor:
         self._display = _ProgramDisplay(self._stop_if_over)
         self._stack, self._bus = ExitStack(), ExitStack()  # of the whole block; of the session
         self._thread: threading.Thread | None = None
+        self._over = False  # its work is done; Python 3.11 takes a thread for ended whose `join` Ctrl-C interrupts
         self._session: Session | None = None
         self._control: Control | None = None
         self._approval: _Approval | None = None
@@ -186,6 +187,7 @@ class LiveMotor:
             self._error = error
         finally:
             self._bus.close()  # the drive is off for good: `jointctl stop` has no program to wait for any more
+            self._over = True
 
     def _stop_if_over(self) -> None:
         """Where the program has come to its end without leaving the block: what it leaves running moves nothing.
@@ -202,7 +204,7 @@ class LiveMotor:
     def _raise(self) -> None:
         """What has ended the session, if it has."""
         self._require_here()
-        if self._thread is None or self._thread.is_alive():
+        if not self._over:
             return
         self._told = True
         error, result = self._error, self.result
@@ -262,6 +264,8 @@ class LiveMotor:
         if loop is None or head == 0:
             self._raise()
             return Newest((), starts_rad, now_ns, self._began_ns)
+        if self._over and self.axis["phase"].min() < AxisPhase.FINISHED:
+            self._raise()  # the loop has died: its last cycle is no state of the joint any more
         ring, axes = loop.block.ring.view(np.ndarray), loop.block.axes
         records = tuple(ring[(head - axes + axis) % RING_RECORDS].copy() for axis in range(axes))
         return Newest(records, starts_rad, now_ns, int(records[0]["time_ns"]))
@@ -301,23 +305,23 @@ class LiveMotor:
     def _end(self) -> None:
         """Ask for the end, and wait for it; Ctrl-C in between asks for more, as in `jointctl run`."""
         control, thread = self._control, self._thread
-        if control is None or thread is None:
+        if control is None or thread is None or thread.ident is None:
             return
         signals = control.signals
         if not signals.count:
             signals.name, signals.count = signals.name or WHO, 1
         interrupted = False
-        while thread.is_alive():
+        while not self._over:
             try:
-                self._join(0.1)
+                self._join()
             except KeyboardInterrupt:
                 signals.count, interrupted = signals.count + 1, True
         if interrupted:
             raise KeyboardInterrupt
 
-    def _join(self, seconds: float | None = None) -> None:
-        if self._thread is not None:
-            self._thread.join(seconds)
+    def _join(self) -> None:
+        while not self._over:
+            time.sleep(POLL_S)
 
     def close(self) -> None:
         if os.getpid() != self._process:

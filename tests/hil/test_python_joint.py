@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -124,6 +126,31 @@ def test_ctrl_c_ramps_down(bench: Any, body: str) -> None:
     assert "KeyboardInterrupt" in ended.err
     assert phases(bench)[-5:] == RAMPED
     assert bench.disabled()
+
+
+def test_ctrl_c_while_it_stops_returns_when_the_drive_is_off(bench: Any) -> None:
+    body = """
+    joint.move_to(0.6, duration_s=4.0, wait=False)
+    joint.wait(1.5)
+    say("stopping")
+    try: joint.stop()
+    except KeyboardInterrupt: say(f"stopped: {joint.state.drive_state}")
+    """
+    program = started(bench, body, sequence__release_s=2.0).saw("stopping")
+    program.signal(signal.SIGINT)
+    ended = program.finished(30.0)
+    assert "stopped: switch on disabled" in ended.err
+    assert bench.disabled()
+
+
+def test_the_state_is_none_once_the_loop_has_died(bench: Any) -> None:
+    program = started(bench, "while joint.state.phase == 'tracking': time.sleep(0.05)").saw("enabled")
+    for process in processes_in(bench.folder):
+        if "loop_process" in Path(f"/proc/{process}/cmdline").read_text():
+            os.kill(process, signal.SIGKILL)
+    ended = program.finished(30.0)
+    assert ended.code == 1
+    assert "MotionFault: the loop process was killed by signal 9" in ended.err
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from pathlib import Path
 from shutil import copytree
 from types import SimpleNamespace
@@ -102,7 +101,7 @@ def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
     """A stop switches the drive off at once: the loop may see that before it has read the request."""
     ended = SimpleNamespace(motion_fault=lambda: MotionFault("DRIVE_NOT_ENABLED (9): it is off", "check the wiring"))
     motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
-    motor._process, motor._thread, motor._error = os.getpid(), threading.Thread(), None
+    motor._process, motor._over, motor._error = os.getpid(), True, None
     motor.result = SimpleNamespace(faulty=[ended], stopped_by=by)
     with pytest.raises(MotionFault) as raised:
         motor._raise()
