@@ -589,6 +589,20 @@ def test_rpdos_of_another_controller_are_counted_for_their_drive(two_drives: Two
     assert list(two_drives.ports["of_others"]) == [0, 3]
 
 
+@pytest.mark.parametrize(("cycles", "counted"), [(5, 0), (6, 1)])
+def test_a_heartbeat_of_our_number_counts_as_anothers_unless_it_may_be_our_last_one_repeated(
+    two_drives: TwoDrives, cycles: int, counted: int
+) -> None:
+    two_drives.ports["heartbeat_cycles"] = 9  # the first cycle sends it
+    two_drives.bus.send(struct.pack("<IB3x8s", 0x77F, 1, b"\x05"))  # the supervisor's, of before
+    for _ in range(cycles):
+        two_drives.cycle(30.0, 0, 1)
+    two_drives.bus.send(struct.pack("<IB3x8s", 0x77F, 1, b"\x05"))
+    two_drives.cycle(30.0, 0, 1)
+    assert list(two_drives.ports["of_another_heart"]) == [counted, counted]
+    assert list(two_drives.ports["of_others"]) == [0, 0]
+
+
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_a_drive_that_ignores_a_stop_costs_both_the_heartbeat(two_drives: TwoDrives, deaf: int) -> None:
     two_drives.ports[deaf].ignored_cycles = IGNORED_MAX_CYCLES + 1
