@@ -38,6 +38,7 @@ _ALL_NODES = 0
 _NAMED_FRAMES = 4  # kinds of frames that a message names
 _MASKED_NODE = 0x7F
 _DOWNLOADS = (1, 6)  # client command specifiers: initiate download, block download
+_UPLOAD = 2  # server command specifier of the answer to an upload
 _CRITICAL = {0x1016, 0x6007, 0x6040, 0x605A, 0x6060}  # they decide whether the drive has power, and when it loses it
 _RPDO_RECORDS = range(0x1400, 0x1600)
 
@@ -91,6 +92,9 @@ class OtherControllers(can.Listener):
         self._own: Counter[tuple[int, bytes]] = Counter()  # that have not come back yet
         self._seen: Counter[str] = Counter()
         self._identifiers: Counter[int] = Counter()
+        self._open: Counter[tuple[int, bytes]] = Counter()  # our requests without an answer: node, index and sub-index
+        self._answers: dict[tuple[int, bytes], bytes] = {}
+        self._doubled: set[int] = set()  # nodes that have answered one request in two ways
         self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
 
     def add_nodes(self, nodes: Collection[int]) -> None:
@@ -114,6 +118,8 @@ class OtherControllers(can.Listener):
                 self._echoes = True
                 return
             self._identifiers[identifier] += 1
+            if identifier - SDO_ANSWER_ID in self._nodes and data and data[0] >> 5 == _UPLOAD:
+                self._note_answer((identifier - SDO_ANSWER_ID, data[1:4]), data)
             if words := self._asked(identifier) if msg.is_remote_frame else self._words(identifier, data):
                 self._seen[words] += 1
             elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE and not msg.is_remote_frame:
@@ -123,11 +129,21 @@ class OtherControllers(can.Listener):
     def sent(self, identifier: int, data: bytes) -> None:
         """This program is about to send a frame."""
         with self._lock:
+            if identifier - SDO_REQUEST_ID in self._nodes:
+                place = identifier - SDO_REQUEST_ID, data[1:4]
+                self._open[place] = max(self._open[place], 0) + 1
             if self._echoes is None and self._own:  # the first one has not come back
                 self._echoes = False
                 self._own.clear()
             if self._echoes is not False:
                 self._own[identifier, data] += 1
+
+    def _note_answer(self, place: tuple[int, bytes], data: bytes) -> None:
+        """A device answers a request once, and the wire may repeat that: another answer is another device's."""
+        self._open[place] -= 1
+        if self._open[place] < 0 and data != self._answers.get(place, data):
+            self._doubled.add(place[0])
+        self._answers[place] = data
 
     def _asked(self, identifier: int) -> str:
         """What a remote frame asks for, if of our nodes: state (node guarding, CiA 301, 7.2.8.2.2.1) or a TPDO."""
@@ -197,9 +213,14 @@ class OtherControllers(can.Listener):
         return ", ".join(kinds) + (f" and {more} other kinds" if more else "")
 
     def refuse(self) -> None:
-        """`BusError` where another controller has the drive: two of them would fight over it."""
+        """`BusError` where another controller has the drive, they would fight over it, or two devices are one node."""
         if found := self.found():
             raise another_controller(found)
+        for node in sorted(self._doubled):  # after that: a request of another one has an answer too
+            raise BusError(
+                f"two devices answer as node {node}: both would take the commands of one",
+                "give each a node number of its own; until then disconnect one",
+            )
 
 
 def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can.Listener) -> canopen.Network:

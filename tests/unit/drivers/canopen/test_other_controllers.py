@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import cast
 
 import can
@@ -71,6 +72,28 @@ def test_its_twins_are_the_drives_own_and_those_of_other_nodes(identifier: int, 
     others = listening()
     assert heard(others, identifier, data) == ""
     others.refuse()
+
+
+def answered(requests: int, *values: int) -> None:
+    """Our requests for a serial number, and then the answers of node 5 to them."""
+    others = listening()
+    for _ in range(requests):
+        others.sent(0x600 + NODE, struct.pack("<BHB4x", 0x40, 0x1018, 4))
+    for value in values:
+        heard(others, 0x580 + NODE, struct.pack("<BHBI", 0x43, 0x1018, 4, value))
+    others.refuse()
+
+
+def test_two_devices_that_answer_as_one_node_refuse_the_run() -> None:
+    with pytest.raises(BusError, match="two devices answer as node 5: both would take the commands of one"):
+        answered(1, 17, 18)
+
+
+@pytest.mark.parametrize(
+    ("requests", "values"), [(1, (17, 17)), (2, (17, 18))], ids=["repeated by the wire", "changed"]
+)
+def test_its_twins_one_device_answers_each_request_once(requests: int, values: tuple[int, ...]) -> None:
+    answered(requests, *values)
 
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_error_frame"])
