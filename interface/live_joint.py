@@ -301,6 +301,11 @@ class LiveMotor:
     def stop(self) -> None:
         self._require_here()
         self._end()
+        self._require_off()
+
+    def _require_off(self) -> None:
+        if self._session is not None:
+            drive_end.require_off(self._session.drive_state)
 
     def _end(self) -> None:
         """Ask for the end, and wait for it; Ctrl-C in between asks for more, as in `jointctl run`."""
@@ -336,5 +341,4 @@ class LiveMotor:
                 self._raise()
             if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
                 raise error
-        if self._session is not None:  # whatever the program has made of a fault
-            drive_end.require_off(self._session.drive_state)
+        self._require_off()  # whatever the program has made of a fault

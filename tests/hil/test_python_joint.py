@@ -253,10 +253,13 @@ def test_a_program_that_goes_on_after_a_fault_learns_that_its_drive_may_be_on(be
     body = """
     try: joint.wait(60.0)
     except jointctl.MotionFault: say("fault")
+    try: joint.stop()
+    except jointctl.DeviceError: say("not stopped")
     """
     program = bench.program(PROGRAM.format(body=body.strip(), approve="")).saw("enabled")
     drive.end()
     ended = program.saw("fault").finished(30.0)
+    assert "not stopped" in ended.err
     assert "DeviceError: the drive did not confirm that it is off" in ended.err
     assert "left" not in ended.err.split()
 
