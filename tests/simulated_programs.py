@@ -421,17 +421,11 @@ class SimulatedThread:
 
     def __init__(self, world: World, *, target: Callable[[], Any], name: str) -> None:
         self._world, self._target = world, target
+        self.ident: int | None = None
 
     def start(self) -> None:
+        self.ident = 1
         self._world.start(SESSION, self._target)
-
-    def is_alive(self) -> bool:
-        return SESSION in self._world.programs
-
-    def join(self, timeout: float | None = None) -> None:
-        until_ns = self._world.now_ns + round((1e6 if timeout is None else timeout) * NANOSECONDS)
-        while self.is_alive() and self._world.now_ns < until_ns:
-            self._world.sleep(LOOK_s)
 
 
 class SimulatedEvent:
