@@ -373,8 +373,8 @@ def _foreign(memory: FaultMemory, count: int, node_id: int, queue: FrameQueue) -
         slot = int64(queue.count)
         if slot >= QUEUE_LENGTH:
             return
-        other = 1 + int64(draw(memory) * 126.0)
-        if other == node_id:
+        other = 1 + int64(draw(memory) * 124.0)  # not 126, the controller's own by default (drive.master_node)
+        if other >= node_id:
             other += 1
         base = (0x80, 0x180, 0x200, 0x280, 0x380, 0x580, 0x700)[int64(draw(memory) * 7.0)]
         for i in range(FRAME_SIZE):
