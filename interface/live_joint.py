@@ -186,8 +186,10 @@ class LiveMotor:
         except BaseException as error:  # for the program's own thread
             self._error = error
         finally:
-            self._bus.close()  # the drive is off for good: `jointctl stop` has no program to wait for any more
-            self._over = True
+            try:
+                self._bus.close()  # the drive is off for good: `jointctl stop` has no program to wait for any more
+            finally:
+                self._over = True
 
     def _stop_if_over(self) -> None:
         """Where the program has come to its end without leaving the block: what it leaves running moves nothing.

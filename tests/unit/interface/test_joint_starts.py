@@ -107,3 +107,16 @@ def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
         motor._raise()
     assert raised.value.message == "DRIVE_NOT_ENABLED (9): it is off" + (f"; stopped by {by}" if by else "")
     assert raised.value.hint == "check the wiring"
+
+
+def test_a_session_is_over_even_where_its_bus_cannot_be_given_back() -> None:
+    """`stop` waits for it."""
+
+    def close() -> None:
+        raise OSError("no such file")
+
+    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
+    motor._over, motor._session, motor._bus = False, SimpleNamespace(run=lambda: "done"), SimpleNamespace(close=close)
+    with pytest.raises(OSError, match="no such file"):
+        motor._run()
+    assert (motor._over, motor.result) == (True, "done")
