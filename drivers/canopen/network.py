@@ -169,7 +169,7 @@ class OtherControllers(can.Listener):
         if identifier - SDO_REQUEST_ID in self._nodes:
             return f"SDO request to node {identifier - SDO_REQUEST_ID} ({identifier:03X}h)"
         if identifier == HEARTBEAT_ID + self._master_node:
-            return f"heartbeat of node {self._master_node}, which is our own (drive.master_node)"
+            return own_heartbeat(identifier)
         if identifier in self._rpdo_ids:
             return f"{self._rpdo_ids[identifier]} ({identifier:03X}h)"
         return ""
@@ -221,6 +221,11 @@ class OtherControllers(can.Listener):
                 f"two devices answer as node {node}: both would take the commands of one",
                 "give each a node number of its own; until then disconnect one",
             )
+
+
+def own_heartbeat(identifier: int) -> str:
+    """What another program sends as `identifier`, in words."""
+    return f"heartbeat of node {identifier - HEARTBEAT_ID}, which is our own (drive.master_node)"
 
 
 def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can.Listener) -> canopen.Network:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
-from jointctl.drivers.canopen.cia import EVENT_DRIVEN, NODE_MASK, State, state_of_word, state_text
+from jointctl.drivers.canopen.cia import EVENT_DRIVEN, State, state_of_word, state_text
 from jointctl.drivers.drive import Drive, DriveGroup
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram
@@ -104,16 +104,12 @@ class CanopenSession(SessionDrive):
 
     def refuse_others(self, port: np.recarray) -> None:
         one = port[0]
-        found = []
-        if one.of_others:
-            found.append(f"{one.of_others} x RPDO to node {one.node} ({one.rpdo_id:03X}h) with other commands")
-        if one.of_another_heart:
-            own = f"heartbeat of node {one.own_heartbeat_id & NODE_MASK}"
-            found.append(f"{one.of_another_heart} x {own}, which is our own (drive.master_node)")
-        if found:
-            from jointctl.drivers.canopen.network import another_controller
+        if one.of_others or one.of_another_heart:
+            from jointctl.drivers.canopen.network import another_controller, own_heartbeat
 
-            raise another_controller(", ".join(found))
+            rpdo = f"RPDO to node {one.node} ({one.rpdo_id:03X}h) with other commands"
+            seen = ((one.of_others, rpdo), (one.of_another_heart, own_heartbeat(int(one.own_heartbeat_id))))
+            raise another_controller(", ".join(f"{count} x {words}" for count, words in seen if count))
 
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"
