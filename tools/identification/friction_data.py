@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -239,14 +239,20 @@ def check_given(given: ForeignFormat) -> None:
             raise UsageError(f"--counts-per-turn is missing: a unit (={unit}) needs it")
 
 
-def refuse_unused(given: Mapping[str, object], usual: Mapping[str, object], used: Container[str], kind: str) -> None:
-    """`UsageError` names an option that was given, by its field, and would not be looked at with data of this kind."""
-    for name, value in given.items():
-        if name not in used and value != usual[name]:
+def refuse_unused(given: object, used: Container[str], kind: str) -> None:
+    """`UsageError` names an option that was given, by its field, and would not be looked at with data of this kind.
+
+    `given`: a dataclass whose defaults are what was not given, and those in it.
+    """
+    for name, value in vars(given).items():
+        if is_dataclass(value):
+            refuse_unused(value, used, kind)
+        elif name not in used and value != getattr(type(given)(), name):
             flag = "--" + re.sub(r"_(radps2?|Hz|NmpA|Nm)$", "", name).replace("_", "-")
             raise UsageError(f"{flag} does not apply to {kind}", "leave it away")
 
 
+OF_SWEEP = "a sweep file, which tells its own columns and units"
 _COLUMNS_OF_MOTION = ("position", "load", "temperature")
 
 
@@ -270,7 +276,7 @@ def refuse_unused_format(given: ForeignFormat, *, timed: bool) -> None:
     if signed.issuperset(given.reverse):
         used.add("reverse")
     what = "a motion in time" if timed else "plateaus"
-    refuse_unused(vars(given), vars(ForeignFormat()), used, f"{what} with the columns that were given")
+    refuse_unused(given, used, f"{what} with the columns that were given")
 
 
 def require_stated(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
@@ -425,8 +431,7 @@ def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, floa
 
 def read_sweep(table: TableFile, given: ForeignFormat) -> FrictionData:
     """Points of a sweep and the constants of its sidecar (or `--ratio`); `DataError` where they contradict."""
-    told = "a sweep file, which tells its own columns and units"
-    refuse_unused(vars(given), vars(ForeignFormat()), ("ratio", "delimiter"), told)
+    refuse_unused(given, ("ratio", "delimiter"), OF_SWEEP)
     if not table.ended:
         # the sweep ends every line, so this one may have lost digits
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")

@@ -65,11 +65,6 @@ class Options:
     swarm: SwarmSettings = field(default_factory=SwarmSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)  # of a time series, whose model is always chosen
 
-    def given(self) -> dict[str, object]:
-        """All by name, those of the swarm and of a motion too."""
-        every = {**vars(self), **vars(self.swarm), **vars(self.motion)}
-        return {name: value for name, value in every.items() if name not in ("swarm", "motion")}
-
     def check(self) -> None:
         """Raise `UsageError` for a value out of range, and for one that the chosen model does not look at."""
         s = self.swarm
@@ -94,8 +89,8 @@ class Options:
         if self.model not in MODELS:
             raise UsageError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
         if unused := _UNUSED.get(self.model):
-            given = self.given()
-            refuse_unused(given, Options().given(), given.keys() - unused, f"--model {self.model}")
+            used = {*vars(self), *vars(self.swarm), *vars(self.motion)} - unused
+            refuse_unused(self, used, f"--model {self.model}")
 
 
 # --- what was found, of both directions ---
@@ -292,8 +287,7 @@ def identify_friction(
     Raises `UsageError` for options out of range, `DataError` where the data or the result are not believable.
     """
     options.check()
-    usual = Options().given()
-    refuse_unused(options.given(), usual, usual.keys() - vars(options.motion), f"{data.path}, which holds plateaus")
+    refuse_unused(options.motion, (), f"{data.path}, which holds plateaus")
     before = check_data(data, limits)
     _refuse(data, before.problems)
     notes, warnings = list(data.notes), list(before.warnings)

@@ -26,6 +26,7 @@ from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.identification.friction_data import (
     MIN_PER_DIRECTION,
+    OF_SWEEP,
     ForeignFormat,
     check_given,
     read_sidecar,
@@ -212,7 +213,7 @@ def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
     table = read_table(path)
     if not {"load_Nm", "velocity_radps", "motor_torque_Nm", "temperature_degC"} <= set(table.columns):
         return None
-    refuse_unused(vars(given), vars(ForeignFormat()), (), "a sweep file, which tells its own columns and units")
+    refuse_unused(given, (), OF_SWEEP)
     ratio = float(read_sidecar(path)["reduction_ratio"])
     settled = table.numbers("settled") == 1.0
     notes = [f"{np.count_nonzero(~settled)} points never settled: not used"] if not settled.all() else []

@@ -346,9 +346,8 @@ def _from_plateaus(
 
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
     """The motion of a run log or of a table, with those of `settings.also` after it."""
-    from jointctl.tools.identification.friction_data import ForeignFormat, refuse_unused
+    from jointctl.tools.identification.friction_data import refuse_unused
     from jointctl.tools.identification.motion_data import (
-        MotionSettings,
         is_series,
         joined,
         motion_of_log,
@@ -370,11 +369,11 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
         return read_motion(path, given, settings)
 
     if plateaus := motion_of_plateaus(path, given):
-        refuse_unused(vars(settings), vars(MotionSettings()), (), f"{path}, which holds plateaus")
+        refuse_unused(settings, (), f"{path}, which holds plateaus")
         return plateaus
     paths = (path, *settings.also)
     if all(each.suffix.lower() == ".mcap" for each in paths):
-        refuse_unused(vars(given), vars(ForeignFormat()), ("ratio",), "a run log, which tells its own columns")
+        refuse_unused(given, ("ratio",), "a run log, which tells its own columns")
     return joined([one(each) for each in paths])
 
 
@@ -383,7 +382,6 @@ def _from_motion(
 ) -> _Found:
     from jointctl.tools.identification import motion_report as reports
     from jointctl.tools.identification.friction_data import ForeignFormat, refuse_unused
-    from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.motion_fit import identify_motion
     from jointctl.tools.identification.plausibility import Verdict, check_motion
     from jointctl.tools.recording.report_page import Section, from_terminal
@@ -391,7 +389,7 @@ def _from_motion(
 
     options.check()
     used = {"knee_radps", "seed", *vars(options.motion)}
-    refuse_unused(options.given(), Options().given(), used, f"{path}, which holds motions")
+    refuse_unused(options, used, f"{path}, which holds motions")
     motion = motion_from(path, given or ForeignFormat(), options.motion)
     output.note(f"fitting {len(motion.time_s)} samples, which takes some seconds")
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
