@@ -7,11 +7,8 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 import uuid
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,59 +19,9 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
-from tests.python_process import Finished, child, children
+from tests.python_process import Finished
 from tests.real_time_joint import real_time_joint
-
-
-class Started:
-    """A `jointctl` process in a session of its own, its streams in files."""
-
-    def __init__(self, folder: Path, arguments: tuple[str, ...], script: Path | None = None, **options: Any) -> None:
-        number = len(list(folder.glob("*.stderr")))
-        self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
-        what = ["-m", "jointctl.tools.verbs"] if script is None else [str(script)]
-        command = [sys.executable, "-P", *what, *arguments]
-        with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
-            options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
-            self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
-
-    @property
-    def err(self) -> str:
-        return self._files[1].read_text()
-
-    def saw(self, text: str, timeout_s: float = 180.0) -> Started:
-        """Wait until stderr holds the text; the first start may have to compile."""
-        return self.until(lambda: text in self.err, text, timeout_s)
-
-    def until(self, condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> Started:
-        """Wait until the condition holds; it must do so before the process ends."""
-        give_up_s = time.monotonic() + timeout_s
-        while not condition():
-            assert self.process.poll() is None, f"ended with {self.process.returncode} before {what!r}: {self.err}"
-            assert time.monotonic() < give_up_s, f"no {what!r} in: {self.err}"
-            time.sleep(0.01)
-        return self
-
-    def signal(self, number: int, *, group: bool = False) -> None:
-        """To the process, or to its group as the keys of a terminal do."""
-        (os.killpg if group else os.kill)(self.process.pid, number)
-
-    def finished(self, timeout_s: float = 180.0) -> Finished:
-        code = self.process.wait(timeout_s)
-        return Finished(code, self._files[0].read_text(), self.err)
-
-    def children(self) -> list[int]:
-        """Process ids of the direct children."""
-        return children(self.process.pid)
-
-    def child(self, module: str) -> int:
-        """The direct child that runs this module."""
-        return child(self.process.pid, module)
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
+from tests.started import Started
 
 
 def processes_in(folder: Path) -> list[int]:

@@ -7,8 +7,8 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +22,8 @@ from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.errors import BusError
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import set_keys, written
+from tests.python_process import Finished
+from tests.started import Started
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
@@ -40,10 +42,6 @@ GENTLE = {
 ERROR_PASSIVE = "20000004#0020000000008000"
 ERROR_PASSIVE_TEXT = "error passive (transmit); transmit errors 128"
 SLOW_GUEST = ("-y", "--allow-low-margin")
-
-
-def jointctl(*arguments: str) -> list[str]:
-    return [sys.executable, "-P", "-m", "jointctl.tools.verbs", *arguments]
 
 
 @pytest.fixture
@@ -72,17 +70,23 @@ def config(tmp_path: Path, rate_Hz: float, duration_s: float) -> str:
 
 
 @pytest.fixture
-def joint(tmp_path: Path, config: str, interface: None) -> Iterator[subprocess.Popen[str]]:
+def joint(tmp_path: Path, config: str, interface: None) -> Iterator[None]:
     """`jointctl hil` on vcan0."""
-    process = subprocess.Popen(jointctl("hil", config, *ON_VCAN), cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    seen = ""
-    while "Ctrl-C ends it" not in seen:
-        seen = process.stderr.readline()
-        assert seen, f"ended with {process.wait()}"
-    yield process
-    process.terminate()
-    process.communicate(timeout=20.0)
+    with started(tmp_path, "hil", config, *ON_VCAN) as process:
+        process.saw("Ctrl-C ends it")
+        yield
+        process.signal(signal.SIGTERM)
+        process.finished(20.0)
+
+
+@contextmanager
+def started(folder: Path, *arguments: str) -> Iterator[Started]:
+    """A command, killed at the end where it still runs."""
+    process = Started(folder, arguments)
+    try:
+        yield process
+    finally:
+        process.end()
 
 
 def ended(dump: subprocess.Popen[str]) -> list[str]:
@@ -104,21 +108,16 @@ def candump(*what: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def tracking(folder: Path, config: str, *, interface: tuple[str, ...] = ON_VCAN) -> Iterator[subprocess.Popen[str]]:
+def tracking(folder: Path, config: str, *, interface: tuple[str, ...] = ON_VCAN) -> Iterator[Started]:
     """A `jointctl run` that has reached its trajectory."""
-    command = jointctl("run", config, *interface, *SLOW_GUEST)
-    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as started:
-        assert started.stderr is not None
-        seen = [""]
-        while "tracking" not in seen[-1]:
-            seen.append(started.stderr.readline())
-            assert seen[-1], f"ended with {started.wait()}: {''.join(seen)}"
-        yield started
+    with started(folder, "run", config, *interface, *SLOW_GUEST) as process:
+        yield process.saw("tracking")
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(jointctl(*arguments), cwd=folder, capture_output=True, text=True, timeout=300.0)
-    assert "Traceback" not in done.stderr, done.stderr
+def run(folder: Path, *arguments: str) -> Finished:
+    with started(folder, *arguments) as process:
+        done = process.finished(300.0)
+    assert "Traceback" not in done.err, done.err
     return done
 
 
@@ -126,7 +125,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.usefixtures("joint")
 def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
     done = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     log = read_run_log(next((tmp_path / "runs").glob("*.mcap")))
     tracking = log.records[log.records.phase == 3]
     assert len(tracking) > 1000
@@ -137,9 +136,9 @@ def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
 def test_candump_sees_the_run_and_cansend_can_stop_it(tmp_path: Path, config: str) -> None:
     assert shutil.which("candump"), "can-utils must be installed"
     with candump("vcan0") as dump:
-        with tracking(tmp_path, config) as started:
+        with tracking(tmp_path, config) as moving:
             subprocess.run(["cansend", "vcan0", "000#8001"], check=True)  # NMT: pre-operational, from somebody else
-            assert started.wait(60.0) == 7
+            assert moving.finished(60.0).code == 7
         lines = ended(dump)
     identifiers = {line.split()[2].split("#")[0] for line in lines}
     assert {"080", "181", "201", "77E", "601", "581"} <= identifiers
@@ -148,35 +147,32 @@ def test_candump_sees_the_run_and_cansend_can_stop_it(tmp_path: Path, config: st
 # --- a stop, and other controllers ---
 def drive_state(folder: Path, node: int = 1, channel: str = "vcan0") -> str:
     info = run(folder, "info", "-i", "socketcan", "-c", channel, "-t", str(node), "--json")
-    return str(json.loads(info.stdout)["state"]["drive_state"])
+    return str(json.loads(info.out)["state"]["drive_state"])
 
 
 @pytest.mark.usefixtures("joint")
 def test_a_stop_in_the_motion_ends_the_run(tmp_path: Path, config: str) -> None:
-    with tracking(tmp_path, config) as started:
+    with tracking(tmp_path, config) as moving:
         stopped = run(tmp_path, "stop", config, *ON_VCAN)
-        assert stopped.returncode == 0, stopped.stderr
-        assert started.stderr is not None
-        rest = started.stderr.read()
-        assert started.wait(60.0) == 130, rest
-    assert "jointctl stop" in rest
+        assert stopped.code == 0, stopped.err
+        done = moving.finished(60.0)
+    assert done.code == 130, done.err
+    assert "jointctl stop" in done.err
     assert drive_state(tmp_path) == "switch on disabled"
 
 
-@pytest.mark.parametrize("after_s", [1.0, 3.0, 5.0, 7.0])  # the guest's start takes some seconds
+@pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0, 3.0])  # some four until it moves
 @pytest.mark.usefixtures("joint")
 def test_a_stop_before_the_motion_is_final(tmp_path: Path, config: str, after_s: float) -> None:
     """The program was starting, listening, or commissioning the drive: it ends, and no frame enables afterwards."""
     with candump("vcan0,201:7FF") as dump:
-        with subprocess.Popen(
-            jointctl("run", config, *ON_VCAN, *SLOW_GUEST), cwd=tmp_path, stderr=subprocess.PIPE, text=True
-        ) as started:
+        with started(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST) as starting:
             time.sleep(after_s)
             stopped = run(tmp_path, "stop", config, *ON_VCAN)
             ended_s = time.time()
-            assert stopped.returncode == 0, stopped.stderr
-            said = started.communicate(timeout=60.0)[1]
-            assert started.returncode == 130, said
+            assert stopped.code == 0, stopped.err
+            done = starting.finished(60.0)
+            assert done.code == 130, done.err
         time.sleep(1.0)
         lines = ended(dump)
     commands = [(float(line.split()[0].strip("()")), line.split("#")[1][:4]) for line in lines]
@@ -194,8 +190,8 @@ def test_a_joint_that_another_master_commands_is_left_alone(tmp_path: Path, conf
         finally:
             foreign.terminate()
         others = {line.split()[2].split("#")[0] for line in ended(dump)}
-    assert refused.returncode == 4, refused.stderr
-    assert "SYNC" in refused.stderr
+    assert refused.code == 4, refused.err
+    assert "SYNC" in refused.err
     assert others <= {"701"}  # the drive's own heartbeat
 
 
@@ -221,33 +217,24 @@ def test_an_arm_on_two_interfaces_moves_and_stops_as_one(tmp_path: Path) -> None
                 own |= {"bus.channel": "vcan1", "drive.node": 1}
             set_keys(document, **{key.replace(".", "__"): value for key, value in own.items()})
         path.write_text(tomlkit.dumps(document))
-    with subprocess.Popen(jointctl("hil", "arm/arm.toml"), cwd=tmp_path, stderr=subprocess.PIPE, text=True) as drives:
-        try:
-            assert drives.stderr is not None
-            while "Ctrl-C ends it" not in (line := drives.stderr.readline()):
-                assert line, f"ended with {drives.wait()}"
-            with tracking(tmp_path, "arm/arm.toml", interface=()) as started:
-                assert started.stderr is not None
-                stopped = run(tmp_path, "stop", "arm/wrist.toml")
-                assert stopped.returncode == 0, stopped.stderr
-                rest = started.stderr.read()
-                assert started.wait(60.0) == 130, rest
-            states = [
-                drive_state(tmp_path, node, channel) for node, channel in ((1, "vcan0"), (2, "vcan0"), (1, "vcan1"))
-            ]
-            assert states == ["switch on disabled"] * 3
-        finally:
-            drives.terminate()
-            drives.communicate(timeout=20.0)
+    with started(tmp_path, "hil", "arm/arm.toml") as drives:
+        drives.saw("Ctrl-C ends it")
+        with tracking(tmp_path, "arm/arm.toml", interface=()) as moving:
+            stopped = run(tmp_path, "stop", "arm/wrist.toml")
+            assert stopped.code == 0, stopped.err
+            done = moving.finished(60.0)
+            assert done.code == 130, done.err
+        states = [drive_state(tmp_path, node, channel) for node, channel in ((1, "vcan0"), (2, "vcan0"), (1, "vcan1"))]
+        assert states == ["switch on disabled"] * 3
 
 
 @pytest.mark.usefixtures("joint")
 def test_an_interface_that_goes_down_in_the_run_stops_the_joint(tmp_path: Path, config: str) -> None:
-    with tracking(tmp_path, config) as started:
+    with tracking(tmp_path, config) as moving:
         subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
-        assert started.wait(60.0) == 7
-        assert started.stderr is not None
-        rest = started.stderr.read()
+        done = moving.finished(60.0)
+    assert done.code == 7
+    rest = done.err
     assert "Traceback" not in rest
     assert "error:" in rest
     assert "vcan0" in rest
@@ -256,26 +243,26 @@ def test_an_interface_that_goes_down_in_the_run_stops_the_joint(tmp_path: Path, 
     subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     time.sleep(0.5)
     stopped = run(tmp_path, "stop", config, *ON_VCAN)
-    assert stopped.returncode == 0, stopped.stderr
+    assert stopped.code == 0, stopped.err
 
 
 @pytest.mark.usefixtures("interface")
 def test_interface_problems_are_told_with_their_cure(tmp_path: Path, config: str) -> None:
     missing = run(tmp_path, "run", config, "-i", "socketcan", "-c", "can7", "-y")
-    assert missing.returncode == 4
-    assert "can7" in missing.stderr
-    assert "ip link set can7 up" in missing.stderr
+    assert missing.code == 4
+    assert "can7" in missing.err
+    assert "ip link set can7 up" in missing.err
     subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
     down = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
-    assert down.returncode == 4
-    assert "vcan0 is down" in down.stderr
+    assert down.code == 4
+    assert "vcan0 is down" in down.err
 
 
 @pytest.mark.usefixtures("interface")
 def test_nobody_on_the_bus(tmp_path: Path, config: str) -> None:
     alone = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
-    assert alone.returncode == 5, alone.stderr
-    assert "does not answer" in alone.stderr
+    assert alone.code == 5, alone.err
+    assert "does not answer" in alone.err
 
 
 @pytest.mark.usefixtures("interface")
@@ -294,17 +281,15 @@ def test_the_cyclic_end_is_non_blocking_and_shares_the_bus_with_python_can() -> 
 @pytest.mark.usefixtures("joint")
 def test_scan_info_and_monitor(tmp_path: Path) -> None:
     found = run(tmp_path, "scan", *ON_VCAN, "--json", "--listen", "0.2")
-    assert found.returncode == 0, found.stderr
-    assert [node["node"] for node in json.loads(found.stdout)["nodes"]] == [1]
+    assert found.code == 0, found.err
+    assert [node["node"] for node in json.loads(found.out)["nodes"]] == [1]
     info = run(tmp_path, "info", *ON_VCAN, "-t", "1", "--json")
-    assert json.loads(info.stdout)["state"]["drive_state"] == "switch on disabled"
-    command = jointctl("monitor", *ON_VCAN, "--count", "2", "--json")
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as monitor:
-        assert monitor.stderr is not None
-        assert "listening on" in monitor.stderr.readline()
+    assert json.loads(info.out)["state"]["drive_state"] == "switch on disabled"
+    with started(tmp_path, "monitor", *ON_VCAN, "--count", "2", "--json") as monitor:
+        monitor.saw("listening on")
         subprocess.run(["cansend", "vcan0", "705#7F"], check=True)
         subprocess.run(["cansend", "vcan0", ERROR_PASSIVE], check=True)
-        out = monitor.communicate(timeout=60.0)[0]
+        out = monitor.finished(60.0).out
     first, second = (json.loads(line) for line in out.splitlines())
     assert (first["kind"], first["text"]) == ("heartbeat", "pre-operational")
     assert (second["kind"], second["text"]) == ("error", ERROR_PASSIVE_TEXT + ", receive errors 0")
@@ -315,32 +300,30 @@ def test_scan_info_and_monitor(tmp_path: Path) -> None:
 def test_a_run_beside_foreign_traffic_tells_what_the_controller_complains_about(tmp_path: Path, config: str) -> None:
     with subprocess.Popen(["cangen", "vcan0", "-g", "5", "-I", "500", "-L", "8"]) as foreign:
         try:
-            with tracking(tmp_path, config) as started:
+            with tracking(tmp_path, config) as moving:
                 subprocess.run(["cansend", "vcan0", ERROR_PASSIVE], check=True)
-                assert started.stderr is not None
-                rest = started.stderr.read()
-                assert started.wait(60.0) == 0, rest
+                done = moving.finished(60.0)
+                assert done.code == 0, done.err
         finally:
             foreign.terminate()
-    assert ERROR_PASSIVE_TEXT in rest
-    assert "power of the drive" in rest
+    assert ERROR_PASSIVE_TEXT in done.err
+    assert "power of the drive" in done.err
 
 
 @pytest.mark.usefixtures("joint")
 def test_a_full_transmit_queue_stops_the_joint_and_is_told(tmp_path: Path, config: str) -> None:
     """A queue that lets next to nothing out fills up, as that of a controller whose frames nobody acknowledges."""
     slow = ["qdisc", "add", "dev", "vcan0", "root", "tbf", "rate", "8kbit", "burst", "32", "limit", "64"]
-    with tracking(tmp_path, config) as started:
+    with tracking(tmp_path, config) as moving:
         subprocess.run(["tc", *slow], check=True)
         try:
-            assert started.stderr is not None
-            rest = started.stderr.read()
-            assert started.wait(60.0) == 7, rest
+            done = moving.finished(60.0)
+            assert done.code == 7, done.err
         finally:
             subprocess.run(["tc", "qdisc", "del", "dev", "vcan0", "root"], check=True)
-    assert "Traceback" not in rest
-    assert "transmit queue of vcan0 is full" in rest
-    assert "txqueuelen" in rest
+    assert "Traceback" not in done.err
+    assert "transmit queue of vcan0 is full" in done.err
+    assert "txqueuelen" in done.err
 
 
 @pytest.mark.usefixtures("joint")
@@ -348,7 +331,7 @@ def test_a_sweep(tmp_path: Path, config: str) -> None:
     (tmp_path / "speeds").write_text("0.2\n-0.2\n")
     options = ("--grid", "list", "--speeds", "speeds", "--warm-up", "0", "--dwell", "0.2", "-o", "friction.csv")
     done = run(tmp_path, "sweep", config, *ON_VCAN, *SLOW_GUEST, *options)
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     assert len((tmp_path / "friction.csv").read_text().splitlines()) >= 3
 
 
@@ -356,7 +339,7 @@ def test_a_sweep(tmp_path: Path, config: str) -> None:
 def test_doctor_tells_the_state_of_the_interface(tmp_path: Path, config: str) -> None:
     subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
     down = run(tmp_path, "doctor", config, *ON_VCAN, "--json")
-    (found,) = [item for item in json.loads(down.stdout)["findings"] if item["topic"] == "interface"]
-    assert (down.returncode, found["status"]) == (1, "problem")
+    (found,) = [item for item in json.loads(down.out)["findings"] if item["topic"] == "interface"]
+    assert (down.code, found["status"]) == (1, "problem")
     assert "vcan0 is down" in found["text"]
     assert "ip link set vcan0 up" in found["remedy"]
