@@ -150,6 +150,7 @@ class CanopenPort:
     malformed: i8  # TPDOs that were too short
     error_frames: i8
     of_others: i8  # RPDOs to the drive that differ from the newest of ours: another controller's
+    of_another_sync: i8  # SYNC between our own cycles
     of_another_heart: i8  # our own heartbeats that the loop has not sent: they would feed the drive's watchdog for us
     send_failures: i8
     consecutive_failures: i4

@@ -171,12 +171,15 @@ def differs(frame: Frame, sent: Frame) -> bool:
 
 @kernel
 def _note_others(port: CanopenPort, frame: Frame, own_rpdo: Frame, own_offset: Frame) -> None:
-    """Count set-points and heartbeats that this loop has not sent.  The system hands nobody its own frames; one that is
-    repeated to us all the same, within the cycle, is like ours, a heartbeat for half of the time until the next one."""
+    """Count set-points, SYNC and heartbeats that this loop has not sent.  The system hands nobody its own frames; one
+    that is repeated to us all the same is like ours, SYNC until the drive has answered and the RPDO is sent, and a
+    heartbeat for half of the time until the next one."""
     if frame.can_id == port.rpdo_id:
         port.of_others += 1 if differs(frame, own_rpdo) else 0
     elif port.offset_rpdo_id != 0 and frame.can_id == port.offset_rpdo_id:
         port.of_others += 1 if differs(frame, own_offset) else 0
+    elif frame.can_id == port.sync_id:
+        port.of_another_sync += 1 if port.in_cycle == 0 and port.answered != 0 else 0
     elif frame.can_id == port.own_heartbeat_id and port.heartbeat_cycles > 0:
         since = (port.cycle - 1) % port.heartbeat_cycles
         port.of_another_heart += 1 if port.cycle > 0 and 2 * since > port.heartbeat_cycles else 0

@@ -132,6 +132,18 @@ def test_set_points_of_another_controller_end_a_run_and_are_named(bench: Any, da
     assert bench.disabled()
 
 
+def test_sync_of_another_controller_ends_a_run_and_is_named(bench: Any) -> None:
+    """The drive takes its torque and samples at every SYNC, whoever sends it."""
+    config = bench.with_joint(trajectory__duration_s=30.0)
+    run = bench.start("run", config, "-y").saw("  tracking")
+    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
+        sender = foreign.send_periodic(can.Message(arbitration_id=SYNC_ID, is_extended_id=False), 0.01)
+        done = run.finished(20.0)
+        sender.stop()
+    done.refused(7, "another controller is active on this bus: ", "x SYNC")
+    assert bench.disabled()
+
+
 def test_heartbeats_that_would_feed_the_drives_watchdog_for_us_end_a_run_and_are_named(bench: Any) -> None:
     """With them a drive without 1400:5 kept its torque when both programs had died."""
     config = bench.with_joint(trajectory__duration_s=30.0)

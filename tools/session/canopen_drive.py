@@ -104,11 +104,12 @@ class CanopenSession(SessionDrive):
 
     def refuse_others(self, port: np.recarray) -> None:
         one = port[0]
-        if one.of_others or one.of_another_heart:
+        if one.of_others or one.of_another_sync or one.of_another_heart:
             from jointctl.drivers.canopen.network import another_controller, own_heartbeat
 
             rpdo = f"RPDO to node {one.node} ({one.rpdo_id:03X}h) with other commands"
-            seen = ((one.of_others, rpdo), (one.of_another_heart, own_heartbeat(int(one.own_heartbeat_id))))
+            heartbeat = own_heartbeat(int(one.own_heartbeat_id))
+            seen = ((one.of_others, rpdo), (one.of_another_sync, "SYNC"), (one.of_another_heart, heartbeat))
             raise another_controller(", ".join(f"{count} x {words}" for count, words in seen if count))
 
     def load_row(self, share: float) -> tuple[str, str]:

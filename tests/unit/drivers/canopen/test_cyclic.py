@@ -529,13 +529,15 @@ class TwoDrives:
             )
         self.link, self.bus = exchange.link_of(self.ports), bus
 
-    def cycle(self, window_s: float, *answering: int) -> tuple[bool, list[int]]:
-        """(whether it has waited for the end of the window, the identifiers that it sent)."""
+    def cycle(self, window_s: float, *answering: int, before: bytes = b"") -> tuple[bool, list[int]]:
+        """(whether it has waited for the end of the window, what it sent); `before` the answers comes a frame."""
         sent: list[int] = []
 
         def drives() -> None:
             while not sent or sent[-1] != 0x80:
                 sent.append(self._identifier())
+            if before:
+                self.bus.send(before)
             for axis in answering:
                 self.bus.send(struct.pack("<IB3xHih", 0x185 + axis, 8, 0x0250, 100 * (axis + 1), 0))
 
@@ -587,6 +589,18 @@ def test_rpdos_of_another_controller_are_counted_for_their_drive(two_drives: Two
         two_drives.bus.send(struct.pack("<IB3x8s", identifier, 4, data))  # none: as ours, not the drive's, not standard
     two_drives.cycle(30.0, 0, 1)
     assert list(two_drives.ports["of_others"]) == [0, 3]
+
+
+def test_sync_counts_as_anothers_unless_it_may_be_our_own_repeated(two_drives: TwoDrives) -> None:
+    sync = struct.pack("<IB3x8s", 0x80, 0, b"")
+    two_drives.bus.send(sync)  # of before
+    two_drives.cycle(0.02)  # our own may be among what waits after a cycle without an answer
+    two_drives.bus.send(sync)
+    two_drives.cycle(30.0, 0, 1, before=sync)  # repeated at once
+    assert list(two_drives.ports["of_another_sync"]) == [0, 0]
+    two_drives.bus.send(sync)
+    two_drives.cycle(30.0, 0, 1)
+    assert list(two_drives.ports["of_another_sync"]) == [1, 1]
 
 
 @pytest.mark.parametrize(("cycles", "counted"), [(5, 0), (6, 1)])
