@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 POLL_S = 0.005
 TABLE_ROWS = 1 << 16  # of `follow`, at most
 PHASES = tuple(in_words(phase) for phase in AxisPhase)
+LONGEST_S = 1e9  # of a wait: its end in nanoseconds is a number of 64 bits
 COMMISSIONED = "commissioned"  # the phase before the first cycle
 OFF = "switch on disabled"
 SetPointValues = tuple[Numbers, Numbers | None, Numbers | None, Numbers | None]  # position to torque
@@ -193,7 +194,7 @@ class Program:
 
     def wait(self, seconds: float) -> None:
         """Wait, and say that the program is alive.  At simulated time the motion goes on for so long."""
-        end_ns = self._motor.now_ns() + round(finite("seconds", seconds) * 1e9)
+        end_ns = self._motor.now_ns() + round(min(finite("seconds", seconds), LONGEST_S) * 1e9)
         while (left_ns := end_ns - self._motor.now_ns()) > 0:
             self._alive()
             self._motor.wait(min(left_ns * 1e-9, 0.05))

@@ -60,8 +60,8 @@ class StreamedLoop(Protocol):
 
 
 def _number(value: Any) -> float:
-    """As `float`, but no text, and no answer to a question."""
-    if isinstance(value, (str, bytes, bool, np.bool_)):
+    """As `float`, but no text, no answer to a question, and nothing that has an imaginary part to lose."""
+    if isinstance(value, (str, bytes, bool, np.bool_, np.complexfloating)):
         raise TypeError
     try:
         return float(value)

@@ -326,7 +326,7 @@ def test_a_joint_is_no_arm(make: Callable[[], object], words: str) -> None:
         make()
 
 
-@pytest.mark.parametrize("value", ["0.1", b"1", True, np.True_, 10**400], ids=str)
+@pytest.mark.parametrize("value", ["0.1", b"1", True, np.True_, np.complex128(0.1 + 0.1j), 10**400], ids=str)
 def test_what_python_takes_for_a_number_and_is_none_moves_nothing(arm: jointctl.Arm, value: Any) -> None:
     rest = arm.state.desired_position_rad
     given: Any = [*rest[:2], value]

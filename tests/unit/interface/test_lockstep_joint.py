@@ -237,6 +237,18 @@ def test_nothing_enables_twice_and_nothing_moves_after_a_stop(joint: Joint) -> N
         joint.enable()
 
 
+def pushed_for_ever() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        joint.step_torque(40.0)
+        joint.wait(1e300)
+
+
+def test_a_wait_without_end_ends_with_the_run() -> None:
+    with pytest.raises(jointctl.MotionFault, match="VELOCITY_LIMIT"):
+        pushed_for_ever()
+
+
 def pushed() -> None:
     with Joint("virtual", lockstep=True) as joint:
         joint.enable()
