@@ -28,13 +28,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import ControllerKind, Encoders
 from jointctl.tools.analysis.linear_loop import (
     Array,
-    ComplexArray,
     LoopSettings,
     StateSpace,
     TwoMasses,
@@ -45,7 +43,7 @@ from jointctl.tools.analysis.linear_loop import (
     two_masses,
 )
 from jointctl.tools.analysis.margin_gate import meets
-from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins
+from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins, margins_on_grid
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
@@ -87,6 +85,7 @@ SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 3, 90
+_AGAIN = (0.3, -0.2, 0.2)  # from the best one, as long as that brings anything
 
 
 @dataclass(frozen=True)
@@ -145,11 +144,15 @@ class Law:
             values["q"] = (values["q"], values["q"])
         return replace(settings, **values)
 
+    def logarithms(self, settings: LoopSettings) -> Array:
+        """What `settings` takes."""
+        return np.log([np.max(getattr(settings, key)) for key in self.keys])
+
     def starts(self, best_first: list[Judged]) -> list[Array]:
         """Where to search: the best ones, each in a valley of its own, since a filter far lower bears other gains."""
         found: list[Array] = []
         for one in best_first:
-            x = np.log([np.max(getattr(one.settings, key)) for key in self.keys])
+            x = self.logarithms(one.settings)
             if all(abs(x[-1] - other[-1]) > 1.0 for other in found):
                 found.append(x)
         return found[:_STARTS]
@@ -394,7 +397,7 @@ class _Search:
             worst = float(np.max(radii))
             return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
         law = controller.response(self._z)
-        phases, gains, peaks = _margins(-(law @ self._responses)[:, :, 0, 0])
+        phases, gains, peaks = margins_on_grid(-(law @ self._responses)[:, :, 0, 0])
         phases, peaks = phases * self._eased, peaks / self._eased
         own = slice(self._of_goals)
         gate = slice(self._of_goals, None)
@@ -419,25 +422,6 @@ def _frequencies_radps(config: Config, period_s: float) -> Array:
         return omega
     near = math.tau * two_masses(config, config.reducer, 1.0, 1.0, False).resonance_Hz * np.geomspace(*_NEAR)
     return np.unique(np.concatenate((omega, near[near < highest])))
-
-
-def _margins(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
-    """(phase margin [deg], gain margin in either direction, largest |S|) of each row on the grid of frequencies."""
-
-    def crossed(values: Array) -> tuple[ComplexArray, NDArray[np.bool_]]:
-        """L between two frequencies where `values` goes through zero, and where it does."""
-        before, after = values[:, :-1], values[:, 1:]
-        crosses = (before > 0.0) != (after > 0.0)
-        share = before / np.where(crosses, before - after, 1.0)
-        return (1.0 - share) * open_loop[:, :-1] + share * open_loop[:, 1:], crosses
-
-    at_one, crosses = crossed(np.log(np.abs(open_loop)))
-    phase = np.degrees(np.min(np.abs(np.angle(-at_one)), axis=1, where=crosses, initial=math.pi))
-    real, crosses = crossed(open_loop.imag)
-    size = np.abs(real.real)
-    crosses &= real.real < 0.0
-    gain = np.min(np.maximum(size, 1.0 / np.where(crosses, size, 1.0)), axis=1, where=crosses, initial=math.inf)
-    return phase, gain, np.max(1.0 / np.abs(1.0 + open_loop), axis=1)
 
 
 def choose_gains(
@@ -491,15 +475,23 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
         if not search.tried:
             for point in product(*(np.geomspace(*span) for span in law.spans)):
                 search.judged(np.log(point))
-        for x in law.starts(sorted(search.tried, key=lambda one: cost(one, least_error))):
-            minimize(
-                lambda x: cost(search.judged(x), least_error), x, method="Nelder-Mead",
-                options={
-                    "maxfev": _EVALUATIONS, "xatol": 0.01, "fatol": 0.01,
-                    "initial_simplex": x + 0.3 * np.vstack((np.zeros(len(x)), -np.eye(len(x)))),
-                },
-            )  # fmt: skip
-        return min(search.tried, key=lambda one: cost(one, least_error))
+
+        def of(one: Judged) -> float:
+            return cost(one, least_error)
+
+        def lowest_from(x: Array, step: float) -> Judged:
+            options = {"maxfev": _EVALUATIONS, "xatol": 0.01, "fatol": 0.01,
+                       "initial_simplex": x + step * np.vstack((np.zeros(len(x)), np.eye(len(x))))}  # fmt: skip
+            minimize(lambda x: of(search.judged(x)), x, method="Nelder-Mead", options=options)
+            return min(search.tried, key=of)
+
+        for x in law.starts(sorted(search.tried, key=of)):
+            best = lowest_from(x, -0.3)
+        for step in _AGAIN:  # a simplex that has shrunk in a curved valley has not found its lowest point
+            before, best = of(best), lowest_from(law.logarithms(best.settings), step)
+            if of(best) > before - 0.01:
+                break
+        return best
 
     best = best_of(None)
     if objective == "quiet" and best.stable:

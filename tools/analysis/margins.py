@@ -12,12 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import (
     MAX_DELAY_PERIODS,
     Array,
+    ComplexArray,
     LinearLoop,
     LoopSettings,
     linear_loop,
@@ -219,13 +221,26 @@ def worst_case(settings: LoopSettings) -> LoopSettings:
     return _worst_cases(settings)[0]
 
 
-def phase_on_grid_rad(open_loop: np.ndarray) -> float:
-    """The phase margin between the frequencies of a response that is close enough, the loop being stable."""
-    logarithm = np.log(np.abs(open_loop))
-    i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
-    share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
-    crossing = (1.0 - share) * open_loop[i] + share * open_loop[i + 1]
-    return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi))
+def margins_on_grid(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
+    """(phase margin [deg], gain margin in either direction, largest |S|) of each row (n, frequencies) of stable loops.
+
+    Between two frequencies L is taken as straight: they are to be close enough.
+    """
+
+    def crossed(values: Array) -> tuple[ComplexArray, NDArray[np.bool_]]:
+        """L between two frequencies where `values` goes through zero, and where it does."""
+        before, after = values[:, :-1], values[:, 1:]
+        crosses = (before > 0.0) != (after > 0.0)
+        share = before / np.where(crosses, before - after, 1.0)
+        return (1.0 - share) * open_loop[:, :-1] + share * open_loop[:, 1:], crosses
+
+    at_one, crosses = crossed(np.log(np.abs(open_loop)))
+    phase = np.degrees(np.min(np.abs(np.angle(-at_one)), axis=1, where=crosses, initial=math.pi))
+    real, crosses = crossed(open_loop.imag)
+    size = np.abs(real.real)
+    crosses &= real.real < 0.0
+    gain = np.min(np.maximum(size, 1.0 / np.where(crosses, size, 1.0)), axis=1, where=crosses, initial=math.inf)
+    return phase, gain, np.max(1.0 / np.abs(1.0 + open_loop), axis=1)
 
 
 def _worst_cases(settings: LoopSettings) -> tuple[LoopSettings, LoopSettings]:
@@ -242,8 +257,8 @@ def _worst_cases(settings: LoopSettings) -> tuple[LoopSettings, LoopSettings]:
         radius = float(np.max(np.abs(loop.closed_loop_poles())))
         if radius >= 1.0:
             return 0.0, -radius, 0.0
-        response = -(law @ loop.joint.response(z))[:, 0, 0]
-        return phase_on_grid_rad(response), 0.0, float(np.min(np.abs(1.0 + response)))
+        (phase_deg,), _, (peak,) = margins_on_grid(-(law @ loop.joint.response(z))[None, :, 0, 0])
+        return float(phase_deg), 0.0, 1.0 / float(peak)
 
     ranks = [rank(case) for case in found]
     return found[ranks.index(min(ranks))], found[int(np.argmin([closest for _, _, closest in ranks]))]
