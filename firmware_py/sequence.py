@@ -161,8 +161,10 @@ def step_enabling(
     """
     if sample.drive_state != DriveState.ENABLED:
         state.stood_rad = state.measured_position_rad
+    if moved_before_start(constants, state):  # a brake that has opened, say, whatever state the drive reports
+        return
     if is_enabled(state, sample):
-        if moved_before_start(constants, state) or not all_enabled:  # a brake that has opened, say
+        if not all_enabled:
             return
         approach_s = constants.sequence.approach_s
         state.table_row = reference_at(constants.trajectory, table, 0, 0.0, state.reference)

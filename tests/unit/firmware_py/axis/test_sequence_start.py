@@ -104,6 +104,20 @@ def test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven(
         assert (state.phase, state.fault) == (phase + 1, Fault.NONE)
 
 
+@pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.PREPARED])
+@pytest.mark.parametrize(("moved_rad", "moved"), [(0.125, False), (0.125 + 1e-12, True), (-0.25, True)])
+def test_nor_one_that_moves_while_its_drive_reports_that_it_is_not_enabled_yet(
+    axis: Any, state: Any, drive_state: DriveState, moved_rad: float, moved: bool
+) -> None:
+    axis.sequence.start_rad, axis.sequence.moved_max_rad = 0.25, 0.125
+    settled(state, 0.25 + moved_rad)
+    state.phase = AxisPhase.ENABLING
+    step_enabling(axis, state, idle_sample(drive_state), axis_table(), True, False)
+    assert (state.phase, state.fault) == (
+        (AxisPhase.DISABLING, Fault.MOVED_BEFORE_START) if moved else (AxisPhase.ENABLING, Fault.NONE)
+    )
+
+
 @pytest.mark.trips(Fault.DRIVE_STAYS_ENABLED, "Fault.DRIVE_STAYS_ENABLED")
 @pytest.mark.stays(Fault.DRIVE_STAYS_ENABLED, "(AxisPhase.WAITING, Fault.NONE)")
 @pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.ENABLED])
