@@ -7,6 +7,7 @@ A joint is an arm of one.  `Motor` is what carries the run out, in real time (`l
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -159,6 +160,7 @@ class Program:
         self._motor, self._axes = motor, motor.axes
         self._stream: SetPointStream | None = None
         self._begun = self._enabled = False
+        self._commands = threading.RLock()  # from rest until the loop has taken a motion: one thread at a time
 
     def __enter__(self) -> Self:
         if self._begun:
@@ -232,15 +234,17 @@ class Program:
         from jointctl.firmware_py.kernel import plain
         from jointctl.firmware_py.live_change import move_duration_s
 
-        starts_rad = self._at_rest()
-        if duration_s is None:
-            ways = zip(self._motor.constants, starts_rad, targets_rad, strict=True)
-            duration_s = max(float(plain(move_duration_s)(axis.change, end - start)) for axis, start, end in ways)
-            if duration_s == 0.0:
-                return
-        motions = self._moves(starts_rad, targets_rad, duration_s)
-        self._require_torques(motions, self._motor.tables, duration_s)
-        self._go(motions, wait)
+        with self._commands:
+            starts_rad = self._at_rest()
+            if duration_s is None:
+                ways = zip(self._motor.constants, starts_rad, targets_rad, strict=True)
+                duration_s = max(float(plain(move_duration_s)(axis.change, end - start)) for axis, start, end in ways)
+                if duration_s == 0.0:
+                    return
+            motions = self._moves(starts_rad, targets_rad, duration_s)
+            self._require_torques(motions, self._motor.tables, duration_s)
+            self._go(motions)
+        self._end_of_motion(wait)
 
     def _moves(self, starts_rad: Sequence[float], targets_rad: Sequence[float], duration_s: float) -> list[NewMotion]:
         from jointctl.tools.session.live_changes import new_motion
@@ -271,14 +275,16 @@ class Program:
             with blamed(name):
                 motions.append(NewMotion(trajectory, checked_motion(config, trajectory[0], table)))
         self._require_torques(motions, tables, float(tables[0, -1, 0]))
-        starts_rad = self._at_rest()
-        ways = zip(self._motor.constants, tables[:, 0, 1] - starts_rad, strict=True)
-        move_s = max(float(plain(move_duration_s)(axis.change, way)) for axis, way in ways)
-        if move_s > 0.0 and self._axes.arm is not None:
-            way = self._moves(starts_rad, tables[:, 0, 1].tolist(), move_s)
-            self._require_torques(way, tables, move_s, "the way to the beginning of the table")
-        self._motor.tables[:, : tables.shape[1]] = tables
-        self._go(motions, wait, move_s)
+        with self._commands:
+            starts_rad = self._at_rest()
+            ways = zip(self._motor.constants, tables[:, 0, 1] - starts_rad, strict=True)
+            move_s = max(float(plain(move_duration_s)(axis.change, way)) for axis, way in ways)
+            if move_s > 0.0 and self._axes.arm is not None:
+                way = self._moves(starts_rad, tables[:, 0, 1].tolist(), move_s)
+                self._require_torques(way, tables, move_s, "the way to the beginning of the table")
+            self._motor.tables[:, : tables.shape[1]] = tables
+            self._go(motions, move_s)
+        self._end_of_motion(wait)
 
     def _require_torques(
         self, motions: Sequence[NewMotion], tables: np.ndarray, duration_s: float, what: str = "the motion"
@@ -292,9 +298,10 @@ class Program:
 
     def _command(self, values: SetPointValues, time_s: float | None) -> None:
         stream = self._following()
-        if self._under_way:
-            raise SetPointError("a motion is under way: set-points are followed from rest", "wait for its end")
-        stream.take(*values, time_s)
+        with self._commands:
+            if self._under_way:
+                raise SetPointError("a motion is under way: set-points are followed from rest", "wait for its end")
+            stream.take(*values, time_s)
 
     def _at_rest(self) -> list[float]:
         """Where the references rest; a motion that is under way comes to its end first."""
@@ -308,7 +315,8 @@ class Program:
         if self._motor.constants[0].trajectory.kind == TrajectoryKind.TABLE:  # its rows may be written again
             holds = self._motor.constants["trajectory"].copy()
             holds["kind"], holds["start_rad"] = TrajectoryKind.STREAM, rest_rad
-            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))], True)
+            self._go([NewMotion(holds[[number]], "rest") for number in range(len(holds))])
+            self._end_of_motion(True)
         return rest_rad
 
     @property
@@ -326,9 +334,11 @@ class Program:
                 return True
         return False
 
-    def _go(self, motions: Sequence[NewMotion], wait: bool, move_s: float = 0.0) -> None:
+    def _go(self, motions: Sequence[NewMotion], move_s: float = 0.0) -> None:
         self._alive()
         self._motor.post(motions, move_s)
+
+    def _end_of_motion(self, wait: bool) -> None:
         while wait and self._under_way:
             self._alive()
             self._motor.wait(POLL_S)

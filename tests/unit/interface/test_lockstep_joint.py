@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -362,3 +363,28 @@ def test_the_first_joint_says_that_it_compiles(
     with Joint("virtual", lockstep=True):
         pass
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_table_of_another_thread_does_not_take_the_place_of_one_that_is_about_to_be_followed(
+    joint: Joint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop reads its rows where they are written: the joint would move as nobody has checked, or jump."""
+    motor: Any = joint._motor
+    take, times_s, start_rad = motor.post, np.linspace(0.0, 1.0, 21), joint.state.desired_position_rad
+    hump_rad = 0.1 * np.sin(np.pi * times_s) ** 2
+    other = threading.Thread(target=joint.follow, args=(times_s, start_rad - hump_rad))
+
+    def post(*motion: Any) -> None:  # the rows are written, and the loop does not know of them yet
+        monkeypatch.setattr(motor, "post", take)
+        other.start()
+        other.join(0.3)
+        take(*motion)
+
+    monkeypatch.setattr(motor, "post", post)
+    joint.follow(times_s, start_rad + hump_rad, wait=False)
+    other.join(60.0)
+    assert not other.is_alive()
+    joint.wait(2.0)
+    ways_rad = joint.records.desired_position_rad[joint.records.phase == AxisPhase.TRACKING] - start_rad
+    assert [ways_rad.max(), ways_rad.min()] == pytest.approx([0.1, -0.1], abs=1e-3)
+    assert np.argmax(ways_rad) < np.argmin(ways_rad)
