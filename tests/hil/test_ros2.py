@@ -102,8 +102,9 @@ def enabled(run: Run, client: Ros2Client) -> None:
 
 def test_enable_and_set_points_garbage_a_second_source_and_silence(bench: Any) -> None:
     run = Run(bench, "--hold", "--allow-remote")
-    with run.client() as client, run.client("other") as other:
+    with run.client() as client, run.client("other") as other, run.client() as twin:
         client.announce()
+        twin.announce()  # the same program, started twice
         other.anonymous(bytes(range(16, 32)))
         run.program.saw("waiting up to")
         client.command(positions=[0.0])  # before it is enabled: for nothing
@@ -118,12 +119,14 @@ def test_enable_and_set_points_garbage_a_second_source_and_silence(bench: Any) -
             share = min(now_s, 1.0) ** 2
             client.command(positions=[0.05 * share * math.sin(now_s)], time_s=1.0 + now_s)
             time.sleep(0.01)
+        twin.command(positions=[0.05 * math.sin(now_s)], time_s=1.0 + now_s)
         other.command(positions=[0.0])
     log = run.ended(7)
     said = texts(log)
     assert "set-points come from ROS 2 node /teleop" in said
     assert "set-point of ROS 2 endpoint 10111213 refused: position_rad (=5) must be in [-0.7..0.7]" in said
     assert "the set-points of this run come from ROS 2 node /teleop, not from ROS 2 endpoint 10111213" in said
+    assert "the set-points of this run come from ROS 2 node /teleop, not from ROS 2 node /teleop (" in said
     assert log.records.fault[-1] == Fault.CLIENT_SILENT
     tracking = log.records[log.records.phase == AxisPhase.TRACKING]
     assert np.ptp(tracking.desired_position_rad) > 0.03

@@ -196,6 +196,7 @@ class Ros2View:
         self._problems: dict[str, tuple[int, str]] = {}  # the newest warning or error, of each joint that had one
         self._refusal = ""
         self._names: dict[bytes, str] = {}
+        self._first: dict[str, bytes] = {}  # the endpoint whose set-points first came under a name
         self._lock = threading.Lock()
         self._keep(self._session.liveliness().declare_token(self._node.token))
         self._put_states = self._publisher(JOINT_STATE_TOPIC.name, JOINT_STATE)
@@ -271,9 +272,20 @@ class Ros2View:
                 self._names[gid] = name
         return name
 
+    def _source_of(self, found: tuple[int, bytes] | None) -> str:
+        """Two nodes of one name, such as a program that was started twice, are two sources."""
+        who = self._name_of(found)
+        if found is None:
+            return who
+        with self._lock:
+            if len(self._first) < MOST_NODES:
+                self._first.setdefault(who, found[1])
+            same = self._first.get(who, found[1]) == found[1]
+        return who if same else f"{who} ({found[1].hex()[:8]})"
+
     def _on_command(self, sample: zenoh.Sample) -> None:
         found = read_attachment(sample.attachment.to_bytes()) if sample.attachment is not None else None
-        who = self._name_of(found)
+        who = self._source_of(found)
         try:
             point: Any = self._types.deserialize_cdr(sample.payload.to_bytes(), SET_POINT)
             self.way.set_point(set_point_of(who, point, len(self._order.names)))
