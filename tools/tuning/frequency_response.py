@@ -437,8 +437,8 @@ def response_of(config: Config, plan: ResponsePlan, records: np.recarray) -> Fre
             continue
         part, at = rows[first:last], np.arange(start, start + count)
         for name, values in (
-            ("u", part.command_torque_Nm), ("y", part.position_rad - part.desired_position_rad),
-            ("other", part.second_position_rad - part.desired_position_rad),
+            ("u", part.command_torque_Nm), ("y", part.position_rad),
+            ("other", part.second_position_rad),
         ):  # fmt: skip
             columns[name].append(np.interp(at, cycle[first:last], np.asarray(values)))
         columns["r"].append(excitation[at % count])

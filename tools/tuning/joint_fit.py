@@ -344,7 +344,7 @@ def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
     found = {}
     for name, value, own in zip(_VALUES, centre, half, strict=True):
         late_s = MODEL_LATE_s if model.tells_link else UNSEEN_LATE_s
-        besides = late_s if name == "late_s" else MODEL_SHARES.get(name, 0.0) * value
+        besides = late_s if name in ("delay_s", "lag_s", "late_s") else MODEL_SHARES.get(name, 0.0) * value
         found[name] = Estimate(float(value), math.hypot(own, besides))
     return found
 

@@ -182,6 +182,23 @@ def test_the_response_is_that_of_the_joint_in_spite_of_a_leg_that_is_disturbed()
     assert grown(found, again) == pytest.approx(1.0)
 
 
+def test_the_bends_of_a_reference_that_is_between_its_rows_are_no_motion_of_the_joint() -> None:
+    """An approach ends anywhere within a cycle: until the next row the reference follows the excitation."""
+    made, joint = plan(pairs=4), RIGID
+    log = records_of(made, joint)
+    table, reference = excitation_table(made, 2.1, T), new(Reference)
+    constants = new(TrajectoryConstants)[0]
+    constants.kind, constants.table_rows = TrajectoryKind.TABLE, len(table)
+    row = 0
+    for i in range(len(log)):
+        row = reference_at(constants, table, row, (i + 0.35) * T, reference[0])
+        log.desired_position_rad[i] = reference[0].position_rad
+    found = response_of(config_of_response(shipped("precise"), None), made, log)
+    frequency = found.frequency_Hz
+    true = sampled_joint(T, 1.2e-3, 0.5e-3, joint, Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
+    assert found.fed.response == pytest.approx(true[:, 1, 0], rel=0.01)
+
+
 def test_a_resonance_that_comes_down_does_not_grow_and_one_that_grows_does() -> None:
     before = made_response(SOFT, (1e-3, 5e-4))
     lower = made_response(TwoMasses(0.9, 1.3, 2.0e4, 15.0, (0.0, 0.0), (12.0, 0.0)), (1e-3, 5e-4))
