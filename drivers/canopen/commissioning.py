@@ -276,13 +276,15 @@ def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: F
         findings.remarks.append("profile velocity mode (PV) instead of cyclic synchronous velocity")
 
 
-def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> list[str]:
-    """Remarks for the user; `DeviceError` where they do not agree."""
+def _compare_rated(
+    name: str, found: float, expected: float | None, tolerance: float, unit: str, count: float = 0.0
+) -> list[str]:
+    """Remarks for the user; `DeviceError` where they do not agree: within half a `count`, which the drive rounds to."""
     if expected is None:
         return [f"drive.{name} is not given: nothing to compare the drive's {found:g} {unit} with"] if found else []
     if found == 0.0:
         raise DeviceError(f"drive.{name} (={expected:g}) cannot be compared: the drive does not tell its rated value")
-    if abs(found - expected) > tolerance * expected:
+    if abs(found - expected) > max(tolerance * expected, 0.501 * count):
         text = f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}"
         finer = unit == "Nm" and abs(found * 1e-3 - expected) <= tolerance * expected
         raise DeviceError(text, 'a drive whose 6076 counts µNm: drive.rated_torque_unit = "uNm"' if finer else "")
@@ -362,11 +364,14 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     """Scaling from the rated values, then the drive's own torque limit (6072, or the maker's own) from the joint's."""
     torque = objects.read_if_present(0x6076, what="motor rated torque")
     current_mA = objects.read_if_present(0x6075, what="motor rated current")
-    rated_mNm, rated_mA = (torque or 0) * RATED_TORQUE_UNITS_mNm[settings.rated_torque_unit], current_mA or 0
+    unit_mNm = RATED_TORQUE_UNITS_mNm[settings.rated_torque_unit]
+    rated_mNm, rated_mA = (torque or 0) * unit_mNm, current_mA or 0
     tolerance = settings.rated_tolerance
     findings.remarks += [
-        *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
-        *_compare_rated("rated_current_A", rated_mA * 1e-3, settings.rated_current_A, tolerance, "A"),
+        *_compare_rated(
+            "rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm", 1e-3 * unit_mNm
+        ),
+        *_compare_rated("rated_current_A", rated_mA * 1e-3, settings.rated_current_A, tolerance, "A", 1e-3),
     ]
     scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
     if scale <= 0.0:

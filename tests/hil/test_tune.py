@@ -171,6 +171,28 @@ def test_a_law_that_cannot_look_whether_the_joint_is_the_same_is_no_end(
     assert "warning: whether it is the same joint before the gains is not measured: it swings" in err.getvalue()
 
 
+def test_a_law_that_is_none_of_the_file_is_no_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gains that the gate names for the spring of the first step would change nothing in the file."""
+    path = written(tmp_path / "soft.toml", "realistic")
+    refusal = MarginError("phase margin (=9.3 deg) must be at least 30 deg", "control.kv = 7.8")
+    monkeypatch.setattr(Carrier, "run", Mock(side_effect=refusal))
+    with pytest.raises(MarginError, match=r"direction: phase margin \(=9\.3 deg\)") as raised:
+        tune(load_config(path), outputs()[0], options=TuneOptions(lockstep=True))
+    assert "control." not in raised.value.hint
+    assert "loop.rate_Hz" in raised.value.hint
+
+
+@pytest.mark.parametrize(("after", "worse"), [(0.029, False), (0.031, True)])
+def test_gains_that_track_worse_than_the_old_ones_are_named(tmp_path: Path, after: float, worse: bool) -> None:
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    job = Tune(load_config(shipped_config("precise")), TuneOptions(lockstep=True), carrier, tmp_path)
+    job._take_verification({"after": {"rmse_mrad": after}, "before": {"rmse_mrad": 0.02}})
+    assert f"RMSE before 0.0200 mrad, after {after:.4f} mrad" in err.getvalue()
+    assert ("warning: the old gains track better; " in err.getvalue()) is worse
+    job._take_verification({"after": {"rmse_mrad": after}, "before_refused": "too soft"})
+
+
 def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def problems(_: Tune) -> None:
         raise ConfigurationProblems(["one", "other"])

@@ -240,6 +240,11 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
     """`MarginError` where the torque that moves the joint and one count on top of it reach the limit."""
     step_Nm, limit_Nm = encoder_step_Nm(config, settings), config.limits.torque_max_Nm
     holding_Nm = (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
+    if holding_Nm >= limit_Nm:
+        raise MarginError(
+            f"friction and gravity need {holding_Nm:.3g} Nm, limits.torque_max_Nm (={limit_Nm:g}) must be more",
+            "a greater limits.torque_max_Nm; or [friction] and joint.gravity_Nm are of another joint",
+        )
     if step_Nm + holding_Nm >= limit_Nm:
         raise MarginError(
             f"the torque would chatter at its limit: one count of the encoder moves it by {step_Nm:.1f} Nm, friction "

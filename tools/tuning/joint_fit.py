@@ -356,7 +356,7 @@ def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
 # The friction of a direction is a constant, because the legs of the motion hardly differ in speed; what it does besides
 # is noise.  Neighbouring samples are alike, so that the interval counts a sample for each turn of the ripple.
 
-LEAST_Nm = 0.5  # less is no gravity
+LEAST_SHARE = 0.025  # of the friction: less is no gravity
 SURE = 4.0  # standard errors
 BLOCK_rad = 0.1  # of the way, one independent value each
 
@@ -372,7 +372,8 @@ class Gravity:
 
     @property
     def found(self) -> bool:
-        return abs(self.torque_Nm) > max(LEAST_Nm, 0.5 * SURE * self.half_Nm)
+        friction_Nm = 0.5 * (self.sliding_Nm[0] - self.sliding_Nm[1])
+        return abs(self.torque_Nm) > max(LEAST_SHARE * friction_Nm, 0.5 * SURE * self.half_Nm)
 
 
 def gravity_of(plan: ResponsePlan, records: Any, period_s: float, zero_rad: float) -> Gravity:

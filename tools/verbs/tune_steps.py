@@ -100,6 +100,8 @@ STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
+SOFTER = ("the step pulls with a law of its own, as stiff as twice the static friction of [friction] asks for: a "
+          "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
@@ -107,6 +109,7 @@ SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the 
 SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
 SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_FROM_s = 5.0
+WORSE = 1.5  # times the error with the gains as they were
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
 REFINE_APART = 0.15  # share by which gains that are tried must differ
@@ -236,7 +239,10 @@ class Tune:
         while True:
             plan = make_plan(config, min(torque_Nm, config.limits.torque_max_Nm))
             inner = config_of_check(config, plan)
-            carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=True)
+            try:
+                carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=True)
+            except MarginError as error:  # gains of the file are none of the check
+                raise MarginError(error.message, SOFTER) from None
             findings = list(motion_findings(config, plan, carried.records, carried.fault, carried.text))
             bad = [finding for finding in findings if finding.status == PROBLEM]
             # it stands, or comes to stand again, under a torque that is too small for it
@@ -503,12 +509,10 @@ class Tune:
         return {**found, "before": self._verified(before, "the same before")}
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
-        shown = [
-            f"{when} {kept[when]['rmse_mrad']:.4f} mrad"
-            for when in ("before", "after")
-            if "rmse_mrad" in kept.get(when, {})
-        ]
-        self.carrier.output.note(f"  RMSE {', '.join(shown)}")
+        rmse = {when: kept[when]["rmse_mrad"] for when in ("before", "after") if "rmse_mrad" in kept.get(when, {})}
+        self.carrier.output.note(f"  RMSE {', '.join(f'{when} {one:.4f} mrad' for when, one in rmse.items())}")
+        if rmse.get("after", 0.0) > WORSE * rmse.get("before", math.inf):
+            self.carrier.output.warning(f"the old gains track better; {self.folder / 'before.toml'} has them")
 
     def _before(self) -> Config:
         """The configuration as it was, on the joint that was found."""

@@ -424,6 +424,14 @@ def test_gains_are_chosen_on_request_for_the_law_of_the_file() -> None:
         run_check(other, choose_gains=True)
 
 
+def test_a_torque_that_does_not_hold_the_joint_is_no_chatter() -> None:
+    """Without friction and gravity the encoder's step alone counts, which is small."""
+    config = shipped("precise", control__learning=None, limits__torque_max_Nm=18.0)
+    with pytest.raises(MarginError, match=r"friction and gravity need 19\.1 Nm, .* \(=18\) must be more"):
+        require_margin(config)
+    assert require_margin(config, allow_low_margin=True).stable
+
+
 KALMAN = {"control__velocity_filter": "kalman", "control__velocity_cutoff_Hz": 60.0}
 
 

@@ -49,7 +49,7 @@ from jointctl.tools.tuning.frequency_response import (
     room_rad,
     speed_and_period,
 )
-from jointctl.tools.tuning.joint_fit import Estimate, fit_from_dict, fit_joint, fitted_again, gravity_of
+from jointctl.tools.tuning.joint_fit import Estimate, Gravity, fit_from_dict, fit_joint, fitted_again, gravity_of
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, shipped
@@ -234,6 +234,13 @@ def test_gravity_is_what_both_directions_have_in_common(gravity_Nm: float) -> No
     assert found.torque_Nm == pytest.approx(gravity_Nm, abs=0.1)
     assert found.found == (gravity_Nm != 0.0)
     assert found.zero_rad == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.01, 40.0])
+def test_a_light_joint_has_gravity_too(size: float) -> None:
+    """What may be friction goes with the friction."""
+    assert Gravity(1.6 * size, 0.3 * size, 0.0, (19.0 * size, -18.0 * size)).found
+    assert not Gravity(0.4 * size, 0.1 * size, 0.0, (19.0 * size, -18.0 * size)).found
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -7,6 +7,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -513,6 +514,13 @@ def test_the_torque_slope_of_the_drive(joint: Any, monkeypatch: pytest.MonkeyPat
             commissioning.set_torque_slope(drive._objects, 0.5, 1000.5)
     assert set(joint.downloads(0x6087)) == {2000}
     assert remark.endswith("; 6087 = 2000 permille/s")
+
+
+@pytest.mark.parametrize(("expected_A", "agrees"), [(0.0445, True), (0.0455, True), (0.0443, False), (0.0457, False)])
+def test_a_rated_value_may_be_off_by_what_the_drive_rounds_it(expected_A: float, agrees: bool) -> None:
+    """A small motor: 45 mA is 1.1 % from 44.5 mA, and 6075 has no more digits."""
+    with nullcontext() if agrees else pytest.raises(DeviceError, match=r"does not agree with the drive's 0\.045 A"):
+        assert commissioning._compare_rated("rated_current_A", 0.045, expected_A, 0.01, "A", 1e-3) == []
 
 
 def test_a_drive_that_does_not_tell_its_rated_value_is_not_compared() -> None:
