@@ -63,6 +63,10 @@ class TooWeak(MotionFault):
     """A joint that stood, stayed behind or swung slowly, hardly pushed: the law is too weak for its friction."""
 
 
+class TooStiff(MotionFault):
+    """A joint that swung fast: its torque is later than is known yet, or its reducer softer."""
+
+
 class NotCarriedOut(Exception):
     """A motion that was declined or only shown (`stopped_by` ""), or stopped by the user; the drive is off."""
 
@@ -334,6 +338,11 @@ def response_by_any_law(
             if not others:
                 raise
             carrier.output.note(f"  {error.message}: once more, {others[0]}")
+        except TooStiff as error:
+            if law not in _MUCH_FRICTION[:2] or FED not in others:
+                raise
+            carrier.output.note(f"  {error.message}: once more, {FED}")
+            return by(FED)
         return by(*others)
 
     return by(*laws)
@@ -428,7 +437,8 @@ def _stage(
             ended = _ended(title, carried)
             if _too_weak(task.config, carried, peak_Nm):
                 raise TooWeak(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
-            raise ended
+            swung_fast = carried.fault == Fault.LIMIT_CYCLE and carried.value >= HUNTING_Hz
+            raise TooStiff(ended.message, ended.hint) if swung_fast else ended
         return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
 
     try:

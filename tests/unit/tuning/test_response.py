@@ -463,7 +463,8 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     light = changed(before, joint__inertia_kgm2=0.5)
     with pytest.raises(MotionFault, match=fault.name):
         response_by_any_law(light, 8, carrier, 55.0)
-    assert laws == ([*attempts[2:], attempts[1]] if weak else attempts[2:3])
+    late = fault == Fault.LIMIT_CYCLE and value > HUNTING_Hz  # torque that is later than believed: not so stiff
+    assert laws == ([*attempts[2:], attempts[1]] if weak else [attempts[2], attempts[1]] if late else attempts[2:3])
 
 
 @pytest.mark.parametrize(("name", "kps"), [("precise", [100.0, 1600.0, 3200.0]), ("realistic", [100.0])])
