@@ -35,7 +35,7 @@ def _command(arguments: tuple[str, ...], folder: Path, environment: dict[str, st
     sys.path[:] = [place for place in sys.path if place]
     sys.argv = ["jointctl", *arguments]
     for number, path in enumerate(streams, 1):
-        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        fd = os.open(path, os.O_WRONLY)
         os.dup2(fd, number)
         os.close(fd)
     sys.stdout = io.TextIOWrapper(open(1, "wb", closefd=False), encoding="utf-8")  # noqa: SIM115
@@ -57,7 +57,7 @@ class WarmProcess:
     """As much of `subprocess.Popen` as tests need."""
 
     def __init__(self, arguments: tuple[str, ...], folder: Path, streams: tuple[Path, Path]) -> None:
-        for path in streams:
+        for path in streams:  # read before the process has come to open them
             path.touch()
         self._process: ForkServerProcess = _WARM.Process(
             target=_command, args=(arguments, folder, dict(os.environ), streams)

@@ -374,6 +374,12 @@ def stands(tab: Tab) -> bool:
     return bool(tab.js(LAST_s) == shown)
 
 
+def comes_to_stand(tab: Tab) -> None:
+    """What was on its way is still drawn, and nothing after it."""
+    eventually(lambda: stands(tab), 15.0)
+    assert stands(tab)
+
+
 def test_pause_zoom_and_trigger(bench: Any, browser: Browser) -> None:
     _, tab, _ = opened(bench, browser)
     start(tab)
@@ -382,12 +388,12 @@ def test_pause_zoom_and_trigger(bench: Any, browser: Browser) -> None:
     moves(tab)
     assert tab.js(f"{ZOOM}.getOption().dataZoom[0].start") == pytest.approx(40.0)  # the zoom outlives new data
     tab.click("pause")
-    eventually(lambda: stands(tab), 15.0)  # what was on its way when it was clicked is still drawn
+    comes_to_stand(tab)
     tab.click("pause")
     moves(tab)
     tab.click("trigger")  # the angle's rising zero crossing, once in 10 s
     tab.until("document.querySelector('[data-testid=\"pause\"]').getAttribute('aria-checked') === 'true'", 40.0)
-    eventually(lambda: stands(tab), 15.0)
+    comes_to_stand(tab)
 
 
 def is_on(tab: Tab, name: str) -> bool:
