@@ -24,12 +24,15 @@ from jointctl.drivers.errors import (
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
-from jointctl.tools.configuration.config import ConfigurationProblems
+from jointctl.tools.configuration.config import Config, ConfigurationProblems
+from jointctl.tools.configuration.found_values import with_break_away
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.sections import Trapezoid
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
-from jointctl.tools.tuning.carry_out import FED_STIFF, FED_STIFFEST, Carrier, TooWeak
+from jointctl.tools.tuning.carry_out import ALONE, FED_STIFF, FED_STIFFEST, Carrier, TooWeak, response_by_any_law
+from jointctl.tools.tuning.joint_fit import fit_of
 from jointctl.tools.verbs import tune_steps
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
@@ -155,6 +158,43 @@ def test_a_motor_that_weighs_more_by_its_file_than_the_whole_joint_is_found_all_
     assert found.joint.inertia_kgm2 == pytest.approx(0.84, rel=0.05)
     assert found.reducer is not None
     assert found.reducer.motor_inertia_kgm2 == pytest.approx(0.3, rel=0.1)
+
+
+@pytest.mark.parametrize("gains", [(300.0, 20.0, 80.0), (80.8, 6.03, 32.16)], ids=["refused", "just accepted"])
+def test_on_a_slow_bus_the_response_finds_gains_of_its_own(tmp_path: Path, gains: tuple[float, float, float]) -> None:
+    """At 250 Hz the gate refuses the weak law, and the file's, or the file's on the joint that is found."""
+    control = dict(zip(("control__kp", "control__kv", "control__observer_radps"), gains, strict=True))
+    path = written(tmp_path / "soft.toml", "realistic", loop__rate_Hz=250, control__velocity_cutoff_Hz=100, **control)
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    before = with_break_away(load_config(path), 19.0)
+    law, task, (found, *_) = response_by_any_law(before, 12, carrier)
+    assert law == ALONE
+    assert task.config.control.kind == "flexible_joint"
+    assert fit_of(found, task.config, 19.0).inertia_kgm2.value == pytest.approx(2.1, rel=0.03)
+
+
+def test_a_map_at_which_the_joint_swings_is_measured_faster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved, speeds = Carrier.run, list[float]()
+
+    def swings(self: Carrier, config: Config, *rest: Any) -> Any:
+        assert isinstance(config.trajectory, Trapezoid)
+        speeds.append(config.trajectory.speed_radps)
+        if len(speeds) < 3:
+            raise LimitCycle("swings")
+        return moved(self, config, *rest)
+
+    monkeypatch.setattr(Carrier, "run", swings)
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    job = Tune(load_config(shipped_config("realistic")), TuneOptions(lockstep=True), carrier, tmp_path)
+    assert len(job._step_map()["kinematic_error_rad"]) >= 2
+    assert speeds == [0.03, 0.06, 0.12]
+    assert err.getvalue().count("swings: once more, faster") == 2
+    speeds[:] = []
+    job.original = job.config = changed(job.config, limits__velocity_max_radps=0.2)
+    with pytest.raises(LimitCycle, match="swings"):
+        job._step_map()  # half of 0.2 rad/s is less than 0.12
+    assert speeds == [0.03, 0.06]
 
 
 @pytest.mark.parametrize("error", [MarginError, TooWeak])

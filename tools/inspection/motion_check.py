@@ -45,6 +45,7 @@ VELOCITY_MAX_radps = 0.5
 COUNTS_IN_VELOCITY = 2.0  # what a coarse encoder may add to it, in steps of its reading
 PEAK = 1.875  # of the velocity over its mean, in a minimum-jerk ramp
 STATIC_FRICTIONS = 2.0  # torque limit of the check, over the static friction that is configured
+LEAST_FRICTIONS = 1.25  # the same where a soft reducer bears no more
 TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
 # The spring reaches the limit at 0.7 of the travel.  Friction that takes half of the limit lets go at 0.36; on the way
 # back the spring has to turn round first, and it takes twice that, with friction as strong as the push 1.07 travels.
@@ -101,9 +102,10 @@ class CheckPlan:
 def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     """`torque_Nm` is the user's; else twice the static friction, or a tenth of what a run may use.
 
-    A reducer that is not rigid may be made unstable by the spring: over a longer travel it is softer.
+    A reducer that is not rigid may be made unstable by the spring: over a longer travel it is softer, and with less
+    torque, if that is not the user's.
     """
-    limits, static_Nm = config.limits, static_friction_Nm(config)
+    limits, static_Nm, given = config.limits, static_friction_Nm(config), torque_Nm is not None
     if torque_Nm is None:
         own_Nm = STATIC_FRICTIONS * static_Nm if static_Nm else TORQUE_SHARE * limits.torque_max_Nm
         torque_Nm = min(own_Nm + abs(config.joint.gravity_Nm), limits.torque_max_Nm)
@@ -121,7 +123,11 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     most = max(travel, min(TRAVEL_MAX_rad, TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)))
     while plan.travel_rad < most and not passes(config_of_check(config, plan)):
         plan = replace(plan, travel_rad=min(LONGER * plan.travel_rad, most))
-    return plan
+    least_Nm = LEAST_FRICTIONS * static_Nm + plan.gravity_Nm if static_Nm and not given else plan.torque_Nm
+    softer = plan
+    while softer.torque_Nm > least_Nm and not passes(config_of_check(config, softer)):
+        softer = replace(softer, torque_Nm=max(softer.torque_Nm / LONGER, least_Nm))
+    return softer
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
@@ -272,7 +278,7 @@ class Motion:
     moved_rad: float  # farthest from the start, with its sign
     work_J: float  # of the commanded torque without gravity: negative if the joint moved against it
     accelerating: float  # torque times change of speed, summed: negative if the joint sped up against the torque
-    break_away_Nm: float  # commanded when the joint began to move
+    break_away_Nm: float  # commanded beside gravity when the joint began to move
     torque_max_Nm: float
     torque_ratio: float | None  # measured over commanded; None where the drive measures none
     other_ratio: float | None  # way of the other encoder over that of this one
@@ -316,7 +322,7 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        break_away_Nm=float(np.abs(torque[: first + 1 or None]).max()),
+        break_away_Nm=float(np.abs(pushed[: first + 1 or None]).max()),
         torque_max_Nm=float(np.abs(torque).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
@@ -515,7 +521,7 @@ def _measured_torque(ratio: float) -> Finding:
 
 
 def _friction(motion: Motion, plan: CheckPlan) -> Iterator[Finding]:
-    text = f"it began to move at {motion.break_away_Nm:.1f} Nm"
+    text = f"it began to move at {motion.break_away_Nm:.1f} Nm{' beside gravity' if plan.gravity_Nm else ''}"
     numbers = {"break_away_Nm": motion.break_away_Nm}
     static_Nm = plan.static_friction_Nm
     if not static_Nm:

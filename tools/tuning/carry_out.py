@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
+from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import passes, require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import static_friction_Nm
@@ -88,9 +89,8 @@ class Carried:
 
 def _ended(title: str, carried: Carried) -> MotionFault:
     assert carried.text is not None
-    return MotionFault(
-        f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice
-    )
+    kind = LimitCycle if carried.fault is Fault.LIMIT_CYCLE else MotionFault
+    return kind(f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice)
 
 
 @dataclass
@@ -237,15 +237,29 @@ def response_task(config: Config, torque_Nm: float | None, legs: int, law: Respo
     """`torque_Nm` at most, None: what fits the joint; `UsageError` where they or the limits do not fit.
 
     With that law, or with that of the configuration where the gate refuses the weak one: on a joint that is known to
-    be soft, with a light motor and a long delay.
+    be soft, with a light motor and a long delay.  Where it refuses the gains of the file too, with those that suit the
+    joint which the file describes.
     """
     if not LEAST_LEGS <= legs <= MOST_LEGS:
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
     moving = config_of_response(config, torque_Nm, law)
     if law is WEAK and not _passes(moving):
         moving = config_of_response(config, torque_Nm, None)
+        if not _passes(moving):
+            moving = config_of_response(_with_chosen_gains(config), torque_Nm, None)
     _, length_s = speed_and_period(moving)
     return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), legs // 2, largest_peak_Nm(moving))
+
+
+def _with_chosen_gains(config: Config) -> Config:
+    """Of the law of the configuration; as it was where none of them are what is wanted, or it has no such law."""
+    from jointctl.tools.analysis.gains import gains_of_file  # here: hardly any response needs a search
+
+    with contextlib.suppress(ConfigurationError):
+        chosen = gains_of_file(config, loop_settings(config)[0])
+        if chosen.best.stable and not chosen.missed:
+            return config.model_copy(update={"control": chosen.control})
+    return config
 
 
 def _passes(config: Config) -> bool:
@@ -380,6 +394,8 @@ def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
     except DataError:
         return task
     config = _with_inertia(task.config, inertia)
+    if _passes(task.config) and not _passes(config):
+        return task
     shown_Nm = task.largest_Nm
     return replace(task, config=config, largest_Nm=min(shown_Nm, largest_peak_Nm(config)))
 

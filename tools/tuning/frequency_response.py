@@ -224,9 +224,6 @@ def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw
 
     None: that of the configuration, without learning: for a joint that is known to be too soft for the weak one.
     """
-    limits = config.limits
-    if torque_Nm is not None and not 0.0 < torque_Nm <= limits.torque_max_Nm:
-        raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
     known = config.friction is not None and config.control.feed_forward != "none"
     keys: dict[str, Any] = {"learning": None, "adaptation": None, "feed_forward": "desired" if known else "none"}
     if law is not None:
@@ -237,13 +234,20 @@ def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw
         if config.encoder.side == "joint":
             own_Hz = config.control.velocity_cutoff_Hz or law.link_cutoff_Hz
             keys["velocity_cutoff_Hz"] = min(own_Hz, law.link_cutoff_Hz)
-    config = with_mode(config, "torque")
-    update: dict[str, Any] = {"control": config.control.model_copy(update=keys)}
-    if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:
-        update["limits"] = limits.model_copy(update={"torque_max_Nm": torque_Nm})
-        update["drive"] = config.drive.free_of_torque_limit()
-    config = config.model_copy(update=update)
+    config = with_mode(with_torque_limit(config, torque_Nm), "torque")
+    config = config.model_copy(update={"control": config.control.model_copy(update=keys)})
     return config if law is None else motor_fed(config)
+
+
+def with_torque_limit(config: Config, torque_Nm: float | None) -> Config:
+    """With no more than the user allows; None: what the configuration does."""
+    limits = config.limits
+    if torque_Nm is None or torque_Nm == limits.torque_max_Nm:
+        return config
+    if not 0.0 < torque_Nm <= limits.torque_max_Nm:
+        raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
+    lowered = limits.model_copy(update={"torque_max_Nm": torque_Nm})
+    return config.model_copy(update={"limits": lowered, "drive": config.drive.free_of_torque_limit()})
 
 
 def motor_fed(config: Config) -> Config:

@@ -77,6 +77,12 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     return torque.model_copy(update={"trajectory": motion})
 
 
+def speeds_in_turn(config: Config) -> list[float]:
+    """[rad/s] for a map that nobody chose a speed for: the next where the joint swings at one."""
+    fastest = SPEED_SHARE * config.limits.velocity_max_radps
+    return [speed for speed in (SPEED_radps, 2.0 * SPEED_radps, 4.0 * SPEED_radps) if speed <= fastest] or [SPEED_radps]
+
+
 def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:
     """What the log of such a motion says; `late_s`: from a command to its torque."""
     from jointctl.tools.analysis.reducer_map import MapRun, late_torque_Nm, tracked

@@ -24,7 +24,6 @@ from jointctl.drivers.errors import (
     MarginError,
     MotionFault,
     TooFewPoints,
-    UsageError,
     one_line,
 )
 from jointctl.firmware_py.input_file import read_input
@@ -80,15 +79,15 @@ from jointctl.tools.tuning.carry_out import (
     verifying_motion,
     with_motion,
 )
-from jointctl.tools.tuning.frequency_response import FrequencyResponse, SPEED_radps, from_dict, motor_fed
-from jointctl.tools.tuning.joint_fit import (
-    JointFit,
-    fit_from_dict,
-    fit_of,
-    gravity_of,
-    values_of_fit,
+from jointctl.tools.tuning.frequency_response import (
+    FrequencyResponse,
+    SPEED_radps,
+    from_dict,
+    motor_fed,
+    with_torque_limit,
 )
-from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
+from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_of, gravity_of, values_of_fit
+from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
@@ -100,7 +99,7 @@ STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
-SOFTER = ("the step pulls with a law of its own, as stiff as twice the static friction of [friction] asks for: a "
+SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
           "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
@@ -133,20 +132,8 @@ class Tune:
     gains: ChosenGains | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        limits, torque_Nm = self.original.limits, self.options.torque_Nm
-        self.config = self.original
         require_encoders(self.original, self.options.law)
-        if torque_Nm is not None:
-            if not 0.0 < torque_Nm <= limits.torque_max_Nm:
-                raise UsageError(
-                    f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm"
-                )
-            self.config = self.config.model_copy(
-                update={
-                    "limits": limits.model_copy(update={"torque_max_Nm": torque_Nm}),
-                    "drive": self.config.drive.free_of_torque_limit(),
-                }
-            )
+        self.config = with_torque_limit(self.original, self.options.torque_Nm)
         response_task(self.config, None, AS_IT_FITS.legs)  # what does not fit is refused before anything moves
         self.verifying = verifying_motion(self.config)
 
@@ -158,7 +145,7 @@ class Tune:
         low, high = limits.position_min_rad, limits.position_max_rad
         task = response_task(self.config, None, AS_IT_FITS.legs)
         top_radps = SWEEP_SHARE * limits.velocity_max_radps
-        inside = f"{low:+.3f} .. {high:+.3f} rad"
+        inside, slowly = f"{low:+.3f} .. {high:+.3f} rad", speeds_in_turn(self.config)
         verified = f"{self.verifying.kind} of the configuration"
         if self.verifying.kind != self.config.trajectory.kind:
             verified = (
@@ -169,7 +156,8 @@ class Tune:
             "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
             f"response   triangle at 0.2 rad/s within {inside}, multisine up to {task.largest_Nm:.1f} Nm, 2 minutes",
             f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
-            "map        once back and forth at 0.03 rad/s, where the reducer is soft",
+            f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft; at up to "
+            f"{slowly[-1]:g} where it swings",
             f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
             "and after it half a minute of the response, for a joint that has changed",
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
@@ -258,6 +246,7 @@ class Tune:
         for finding in findings:
             self.carrier.output.note(f"  {finding.topic}: {finding.text}")
         needed_Nm = max((finding.numbers.get("break_away_Nm", 0.0) for finding in findings), default=0.0)
+        needed_Nm += abs(config.joint.gravity_Nm)
         allowed_Nm = self.config.limits.torque_max_Nm
         if needed_Nm > FRICTION_SHARE * allowed_Nm:
             raise MotionFault(
@@ -433,9 +422,17 @@ class Tune:
         """Of a joint with two encoders and a soft reducer; nothing else has a use for it."""
         if self.config.reducer is None or self.config.joint_encoder is None:
             return {}
-        without = self.config.reducer.model_copy(update={"map": None})
-        moving = config_of_map(self.config.model_copy(update={"reducer": without}), MapOptions())
-        carried = self.carrier.run(moving, ConfiguredMotion(moving, trajectory_table(moving)), "map")
+        unmapped = self.config.model_copy(update={"reducer": self.config.reducer.model_copy(update={"map": None})})
+        *rest, last = speeds_in_turn(self.config)
+        for speed_radps in (*rest, last):
+            moving = config_of_map(unmapped, MapOptions(speed_radps=speed_radps))
+            try:
+                carried = self.carrier.run(moving, ConfiguredMotion(moving, trajectory_table(moving)), "map")
+                break
+            except LimitCycle as error:
+                if speed_radps == last:
+                    raise
+                self.carrier.output.note(f"  {error.message}: once more, faster")
         settings, _ = loop_settings(moving)
         self.found_map = found_map(map_run(moving, carried.records, settings.delay_s + settings.lag_s))
         encoder = self.config.encoder

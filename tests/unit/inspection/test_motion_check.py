@@ -18,10 +18,11 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults import FaultKind
-from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margin_gate import passes, require_margin
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
+from jointctl.tools.configuration.conversions import static_friction_Nm, velocity_of_a_count_radps
+from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import APPROACH_MIN_S
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.inspection.motion_check import (
@@ -38,8 +39,9 @@ from jointctl.tools.inspection.motion_check import (
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
+from jointctl.tools.tuning.frequency_response import motor_fed
 from jointctl.tools.verbs import doctor as doctor_motion_module
-from tests.configurations import changed, shipped
+from tests.configurations import changed, shipped, written
 from tests.made_faults import one_fault
 from tests.two_encoders import NODE, config_with
 
@@ -81,6 +83,24 @@ def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tm
         make_plan(config_with(tmp_path), 60.1)
 
 
+def test_a_soft_joint_on_a_slow_bus_is_pulled_farther_then_with_less_torque(tmp_path: Path) -> None:
+    slow = {"loop__rate_Hz": 250, "control__velocity_cutoff_Hz": 100}
+    wide = motor_fed(load_config(written(tmp_path / "wide.toml", "realistic", **slow)))
+    narrow = changed(wide, limits__position_min_rad=-0.4, limits__position_max_rad=0.4)
+    static_Nm = static_friction_Nm(wide)
+    assert static_Nm is not None
+    plan = make_plan(wide, None)
+    assert (plan.travel_rad, plan.torque_Nm) == (0.3, 2.0 * static_Nm)
+    plan = make_plan(narrow, None)
+    assert plan.travel_rad == 0.2
+    assert 1.25 * static_Nm < plan.torque_Nm < 1.6 * static_Nm
+    assert passes(config_of_check(narrow, plan))
+    findings, _, fault = checked(narrow)
+    assert fault is Fault.NONE
+    assert all(finding.status != PROBLEM for finding in findings.values())
+    assert make_plan(narrow, 2.0 * static_Nm).torque_Nm == 2.0 * static_Nm  # which the user wants
+
+
 def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
@@ -101,6 +121,17 @@ def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: f
     made = CheckMotion(config_of_check(config, plan), plan).constants(REPORT, motion_table(plan, 0.1))[0].limits
     assert made.frozen_torque_Nm == pytest.approx(watched_Nm)
     assert made.frozen_torque_Nm < plan.torque_Nm
+
+
+@pytest.mark.parametrize("gravity_Nm", [-12.0, 0.0, 12.0])
+def test_the_torque_to_break_away_is_that_beside_gravity(tmp_path: Path, gravity_Nm: float) -> None:
+    """A pull down takes less torque than friction, a pull up takes more."""
+    lever = {"gravity_Nm": abs(gravity_Nm), "gravity_zero_rad": -math.copysign(0.5 * math.pi, gravity_Nm)}
+    gravity = {f"{section}__{key}": value for section in ("joint", "virtual") for key, value in lever.items()}
+    findings, _, fault = checked(config_with(tmp_path, **gravity))
+    assert fault is Fault.NONE
+    assert findings["friction"].numbers["break_away_Nm"] == pytest.approx(22.4, abs=1.5)
+    assert ("beside gravity" in findings["friction"].text) == bool(gravity_Nm)
 
 
 def test_the_motion_is_smooth_and_ends_where_it_begins(tmp_path: Path) -> None:

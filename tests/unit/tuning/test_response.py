@@ -19,6 +19,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Encoders, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
+from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.configuration.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.configuration.records import axis_constants
@@ -408,14 +409,19 @@ def test_after_the_response_its_friction_is_fed_forward_and_no_more(
     assert plant_settings(config) == plant_settings(shipped("precise"))
 
 
-def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own() -> None:
+@pytest.mark.parametrize(("observer_radps", "own"), [(30.0, True), (80.0, False)])
+def test_a_joint_that_is_too_soft_for_the_weak_law_is_moved_by_its_own(observer_radps: float, own: bool) -> None:
+    """Where the gate refuses the gains of the file too, by others of that law."""
     soft = shipped(
         "realistic", reducer__loop_stiffness_Nmprad=5.7e4, reducer__motor_inertia_kgm2=0.43, control__kp=49.0,
-        control__kv=5.7, margin__loop_delay_s=1.9e-3, margin__current_lag_s=0.95e-3,
+        control__kv=5.7, control__observer_radps=observer_radps, margin__loop_delay_s=1.9e-3,
+        margin__current_lag_s=0.95e-3,
     )  # fmt: skip
-    own = response_task(soft, None, AS_IT_FITS.legs).config
-    assert own.control.kind == "flexible_joint"
-    assert (own.control.kp, own.control.kv, own.control.learning) == (49.0, 5.7, None)
+    assert passes(soft) is own
+    moving = response_task(soft, None, AS_IT_FITS.legs).config
+    assert passes(moving)
+    assert (moving.control.kind, moving.control.learning) == ("flexible_joint", None)
+    assert ((moving.control.kp, moving.control.kv) == (49.0, 5.7)) is own
     weak = response_task(shipped("realistic"), None, AS_IT_FITS.legs).config  # the twin
     assert weak.control.kind == "computed_torque_observer"
     assert weak.control.kv == 20.0
