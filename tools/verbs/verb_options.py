@@ -196,8 +196,23 @@ def _with_units(parse: Callable[..., Any], args: list[str]) -> Any:
     return given, *rest
 
 
+@contextmanager
+def _unread_is_no_error() -> Iterator[None]:
+    """Of a page of help, the version or a shell's completion."""
+    try:
+        yield
+    except BrokenPipeError:
+        abandon(sys.stdout)
+        raise typer.Exit from None
+
+
 class Verb(TyperCommand):
     """A flag shows no type in the help; a number whose name has a unit may be given in another one."""
+
+    def make_context(self, *args: Any, **keywords: Any) -> Any:
+        """What was given to the verb; the page of help, and its end."""
+        with _unread_is_no_error():
+            return super().make_context(*args, **keywords)
 
     def format_help(self, *args: Any) -> None:
         """The page of help."""
@@ -234,12 +249,8 @@ class Verbs(TyperGroup):
 
     def make_context(self, *args: Any, **keywords: Any) -> Any:
         """What was given on the command line, which may be a configuration."""
-        with _interruption_kept():
-            try:
-                return super().make_context(*args, **keywords)
-            except BrokenPipeError:  # of the version, or of a shell's completion
-                abandon(sys.stdout)
-                raise typer.Exit from None
+        with _interruption_kept(), _unread_is_no_error():
+            return super().make_context(*args, **keywords)
 
     def invoke(self, ctx: Any) -> Any:
         """The verb."""

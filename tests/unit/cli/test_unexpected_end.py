@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -148,6 +149,23 @@ def test_a_broken_pipe_in_a_verb_is_no_silent_end() -> None:
     app.callback()(lambda: None)
     with pytest.raises(RuntimeError, match="Broken pipe"):
         app(["one"], standalone_mode=False)
+
+
+def test_a_page_of_help_that_nobody_reads_to_its_end_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`jointctl run --help | head -40`: its last line is written when `head` has gone."""
+    abandoned = Mock()
+    monkeypatch.setattr(verb_options, "abandon", abandoned)
+    app = typer.Typer(cls=Verbs)
+
+    def shown(_: bool) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    @app.command(cls=Verb)
+    def one(page: bool = typer.Option(False, callback=shown)) -> None: ...
+
+    app.callback()(lambda: None)
+    assert app(["one", "--page"], standalone_mode=False) == 0
+    abandoned.assert_called_once_with(sys.stdout)
 
 
 def test_what_the_encoding_of_the_terminal_lacks_is_escaped(tmp_path: Path) -> None:
