@@ -161,7 +161,7 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: shipped_control("precise"), ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
+        ((4.0, 300.0, 8), (6.0, 45.0, 5), (5.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
     ),
     "paper": Law(
         "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,

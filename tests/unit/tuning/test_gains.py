@@ -130,6 +130,19 @@ def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_
     assert hardly_damped.phase_margin_deg >= 0.5 * config.margin.min_phase_margin_deg
 
 
+@pytest.mark.parametrize(("late_s", "low"), [(1.6e-3, False), (2.4e-3, True)])
+def test_a_soft_joint_with_the_motors_encoder_alone_gets_that_filter_where_it_is_late(late_s: float, low: bool) -> None:
+    """A light motor: behind the usual filter kv would be 4, and the error three times as large."""
+    fit = fit_of(1.28, late_s, 1.0, 2.7e4)
+    config = known(shipped("realistic", joint_encoder=None), fit)
+    found = choose_gains(config, fit.intervals())
+    assert (found.law.name, found.missed) == ("precise", {})
+    assert (found.control.velocity_cutoff_Hz < 20.0) is low
+    assert found.control.kv > 6.0
+    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
+
+
 def test_a_share_that_was_not_seen_may_be_any_and_leaves_the_resonance() -> None:
     fit = replace(fit_of(2.1, 1.8e-3, 1.1, 2.6e4), tells_link=False)
     estimates = {**fit.values, "link_kgm2": Estimate(1.1, 0.5), "resonance_Hz": Estimate(fit.resonance_Hz.value, 0.0)}
