@@ -219,6 +219,7 @@ class LiveMotor:
             if result.stopped_by:  # a drive that a stop has switched off, say
                 fault = MotionFault(f"{fault.message}; stopped by {result.stopped_by}", fault.hint)
             raise fault
+        self._require_off()
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", AGAIN)

@@ -47,7 +47,7 @@ POLLS_PER_TIMEOUT = 20
 LONGEST_TIMEOUTS = 4
 PERIOD_S = 1.0
 MISSED = 3  # reads in a row without an answer, until it is an error before enabling and a warning afterwards
-_HINT = "another program uses this drive: find it; the run is over, and the drive is off"
+_HINT = "find out which; the run is over"
 _ALONE = "RPDOs that get lost while our heartbeat does not stop the joint only when the loop withholds its heartbeat"
 
 
@@ -348,7 +348,8 @@ class WatchdogGuard:
             if data[: len(expected)] != expected:
                 found = int.from_bytes(data[: len(expected)], "little")
                 self._changed = self._changed or (
-                    f"node {self._node}: {name} was changed to {found} ({found:X}h) by another program, {value} was set"
+                    f"node {self._node}: {name} was changed to {found} ({found:X}h) "
+                    f"by another program or the drive itself, {value} was set"
                 )
 
         return on_answer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from shutil import copytree
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import pytest
 from jointctl import live_joint
 from jointctl.drivers import stop_note
 from jointctl.drivers.bus_lock import lock_name
-from jointctl.drivers.errors import MotionFault
+from jointctl.drivers.errors import DeviceError, JointctlError, MotionFault
 from jointctl.drivers.stop_note import now_ns, write_note
 from jointctl.joint import Joint
 from jointctl.program import Wanted, axes_of, wanted_source
@@ -107,6 +108,27 @@ def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
         motor._raise()
     assert raised.value.message == "DRIVE_NOT_ENABLED (9): it is off" + (f"; stopped by {by}" if by else "")
     assert raised.value.hint == "check the wiring"
+
+
+@pytest.mark.parametrize(
+    ("state", "raised"),
+    [
+        ("switch on disabled", (MotionFault, "the run has ended, by jointctl stop; the joint is off")),
+        ("unknown: no answer", (DeviceError, "the drive did not confirm that it is off (=unknown: no answer)")),
+    ],
+)
+def test_after_a_stop_the_joint_is_called_off_only_where_its_drive_has_confirmed_it(
+    state: str, raised: tuple[type[JointctlError], str]
+) -> None:
+    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
+    motor._process, motor._over, motor._error, motor._control = os.getpid(), True, None, None
+    motor.result, motor._session = (
+        SimpleNamespace(faulty=[], stopped_by="jointctl stop"),
+        SimpleNamespace(drive_state=state),
+    )
+    kind, text = raised
+    with pytest.raises(kind, match=re.escape(text)):
+        motor._raise()
 
 
 def test_a_session_is_over_even_where_its_bus_cannot_be_given_back() -> None:

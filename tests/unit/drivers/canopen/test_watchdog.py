@@ -495,10 +495,11 @@ def test_bytes_behind_the_value_are_not_part_of_it() -> None:
 
 def test_the_first_change_is_told_with_both_values() -> None:
     answers = Answers()
-    text = "node 1: object 6007 (abort connection option) was changed to 18 (12h) by another program, 3 was set"
+    text = "6007 (abort connection option) was changed to 18 (12h) by another program or the drive itself, 3 was set"
     for data in (b"\x12\0\xff\xff", b"\x05\0"):
-        with pytest.raises(DeviceError, match=re.escape(text)):
+        with pytest.raises(DeviceError, match=re.escape(text)) as raised:
             answers.says(0x6007, data)
+        assert "off" not in raised.value.hint  # that is known when the drive has been read
 
 
 @pytest.mark.parametrize("confirmed", [False, True])
