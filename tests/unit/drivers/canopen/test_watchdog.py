@@ -413,6 +413,26 @@ def test_what_cannot_be_read_keeps_the_loop_from_enabling_and_later_is_a_warning
         run.polled(60, 0.2)
 
 
+@pytest.mark.parametrize(("every_s", "raises"), [(0.04, True), (0.07, False)])
+def test_reads_of_another_program_that_leave_no_room_keep_the_loop_from_enabling(
+    run: Run, every_s: float, raises: bool
+) -> None:
+    """The loop waited without a word, and enabled the joint when they ended, however long after its user's yes."""
+
+    def poll_beside_them() -> None:
+        for _ in range(200):
+            run.bus.send(0x581, bytes.fromhex("4b416000 50020000"))
+            run.polled(1, every_s)
+
+    if not raises:
+        poll_beside_them()
+        assert run.guard.confirmed
+        return
+    with pytest.raises(DeviceError, match=r"cannot be read any more: SDO transfers of another program leave no time"):
+        poll_beside_them()
+    assert run.now_s < 105.0
+
+
 def test_it_costs_four_uploads_a_second(run: Run) -> None:
     run.polled(12)
     run.bus.requests.clear()
