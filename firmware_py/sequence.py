@@ -122,13 +122,13 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             return
         enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
         if not moving and not enabled:
-            # good samples are waited for no longer; how long the supervisor may take is for `check_supervision`
-            state.phase_cycle = 0
-            state.held_up_cycles = 0
             if constants.sequence.may_enable != 0:
                 state.ready = 1
                 if state.held_back == 0:
                     enter(state, AxisPhase.ENABLING)
+            else:  # good samples are waited for no longer; how long the supervisor may take is for `check_supervision`
+                state.phase_cycle = 0
+                state.held_up_cycles = 0
             return
     if waited_too_long(state, constants.sequence.wait_max_cycles) and not noise:
         if state.sample_count == 0:

@@ -295,6 +295,23 @@ def test_no_drive_is_enabled_while_another_joint_moves(moving: int) -> None:
     assert requests == {DriveRequest.OFF}
 
 
+@pytest.mark.parametrize(("allowed", "faulty"), [(1, 1), (0, 0)])
+def test_joints_that_never_stand_at_once_do_not_wait_for_a_moment_in_which_they_do(allowed: int, faulty: int) -> None:
+    """They were enabled in the first cycle in which all readings happened to be slow, however long after the start.
+
+    Its twin waits for the supervisor, as long as it takes.
+    """
+    arm = Arm()
+    arm.constants["sequence"]["may_enable"] = allowed
+    for turn in range(20):
+        arm.moving_rad = [0.0, 0.0]
+        for step in range(12):
+            arm.moving_rad[turn % 2] = 2e-4 * (-1) ** step
+            arm.run(1)
+    assert [fault for fault in arm.faults if fault] == [Fault.NOT_AT_STANDSTILL] * faulty
+    assert arm.ended == bool(faulty)
+
+
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING])
 def test_a_fault_before_the_torque_switches_every_axis_off_in_the_same_cycle(phase: AxisPhase) -> None:
     arm = Arm()
