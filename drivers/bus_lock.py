@@ -401,19 +401,17 @@ def wait_for_answers(holders: Iterable[Holder], timeout_s: float = ANSWER_S) -> 
 
 def marked_processes(name: str, proc: Path = Path("/proc")) -> list[int]:
     """Processes that act for the holder of this lock, ourselves not among them; of this user, or all for root."""
-    return [
-        int(folder.name)
-        for folder in proc.glob("[0-9]*")
-        if int(folder.name) != os.getpid() and is_marked(int(folder.name), name, proc)
-    ]
+    pids = (int(folder.name) for folder in proc.glob("[0-9]*"))
+    return [pid for pid in pids if pid != os.getpid() and is_marked(pid, name, proc)]
 
 
 def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
-    """Whether the process has the marker of this lock; False where this user may not look."""
+    """Whether the process has the marker of this lock, `LOCKS`: of any; False where this user may not look."""
+    mark = f"/memfd:{name}" if name == LOCKS else f"/memfd:{name} "
     with contextlib.suppress(OSError):
         for link in (proc / str(pid) / "fd").iterdir():
             with contextlib.suppress(OSError):
-                if os.readlink(link).startswith(f"/memfd:{name} "):
+                if os.readlink(link).startswith(mark):
                     return True
     return False
 
@@ -548,8 +546,7 @@ class StopCall:
 
     def _end_by_force(self, note: Callable[[str], None]) -> None:
         """SIGTERM, then SIGKILL, to every process that still acts for the controller."""
-        pids = marked_processes(self._name)
-        if not pids:
+        if not (pids := marked_processes(self._name)):
             return
         note(f"it does not end by itself: ending process {', '.join(map(str, pids))}; {ARMED}")
         for number, wait_s in ((signal.SIGTERM, TERM_S), (signal.SIGKILL, KILL_S)):
@@ -560,10 +557,10 @@ class StopCall:
 
 def end_programs(
     calls: Sequence[StopCall], note: Callable[[str], None], ended: Callable[[], None] = lambda: None
-) -> None:
+) -> bool:
     """Of all buses, until no controller is found on any: while one ends, another may come on a bus that was free.
 
-    What holds for several buses, as of the one program that controls an arm, is noted once.
+    Whether there was one.  What holds for several buses, as of the one program that controls an arm, is noted once.
     """
     noted: set[str] = set()
 
@@ -572,14 +569,15 @@ def end_programs(
             noted.add(text)
             note(text)
 
-    for call in calls:
-        call.end(note_once, ended)
+    found = [call.end(note_once, ended) for call in calls]
     for _ in range(LOOKS):
-        found = [call.again(note_once, ended) for call in calls]
-        if not any(found):
+        again = [call.again(note_once, ended) for call in calls]
+        if not any(again):
             break
+        found += again
     for call in calls:
         call.clear_away(note_once)
+    return any(found)
 
 
 def _signalled(pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:

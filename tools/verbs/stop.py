@@ -20,8 +20,9 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     """Stop and disable the drive now, or all those of an arm, also while another program controls them."""
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
-    from jointctl.drivers.bus_lock import StopCall, end_programs
+    from jointctl.drivers.bus_lock import StopCall, end_programs, marked_processes
     from jointctl.drivers.drive import common_state, is_safe
+    from jointctl.drivers.stop_note import LOCKS
     from jointctl.tools.verbs.bench_drive import stop_targets
 
     path = config_path(config)
@@ -43,7 +44,11 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
         switch_off()
         from jointctl.tools.session.result import require_off  # takes its time to load: before the last look
 
-        end_programs(calls, output.note, switch_off)
+        found = end_programs(calls, output.note, switch_off)
+    if not found and (others := marked_processes(LOCKS)):  # it may be the joint that was meant
+        buses = ", ".join(":".join(on) for on in dict.fromkeys(target.place for target in targets.values()))
+        pids = ", ".join(map(str, sorted(others)))
+        output.warning(f"found no program to end on {buses}; process {pids} controls another bus, and goes on")
     if failures:
         raise failures[0]
     state = common_state(list(targets), states)

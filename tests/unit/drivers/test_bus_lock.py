@@ -38,6 +38,7 @@ from jointctl.drivers.bus_lock import (
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import keep_from_forks
+from jointctl.drivers.stop_note import LOCKS
 from tests.python_process import forked
 
 
@@ -519,6 +520,11 @@ def test_the_processes_of_a_controller_are_found_by_their_mark(tmp_path: Path) -
     (tmp_path / "13").mkdir()
     assert sorted(marked_processes("its-name", proc)) == [7, 8]
     assert [pid for pid in (7, 8, 11, 12, 13, 14) if is_marked(pid, "its-name", proc)] == [7, 8]
+
+
+def test_those_of_any_lock_are_found(tmp_path: Path) -> None:
+    links = {7: [f"/memfd:{lock_name('socketcan', 'can0')} (deleted)"], 8: ["/memfd:jointctl-loop (deleted)"]}
+    assert marked_processes(LOCKS, marked_proc(tmp_path, links)) == [7]
 
 
 @pytest.mark.parametrize(("still", "refused"), [([[42], []], False), ([[42], [42]], True), ([[], []], False)])

@@ -301,6 +301,18 @@ def test_whatever_goes_wrong_with_the_drive_its_program_is_ended(
     assert len(calls) == 1
 
 
+@pytest.mark.parametrize("found", [True, False])
+def test_who_controls_another_bus_is_named_where_no_one_was_stopped(
+    stopped_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], found: bool
+) -> None:
+    """The joint that moves may be that of another file: its user would read that the drive is off."""
+    monkeypatch.setattr(canopen_bench.CanTarget, "switch_off", lambda *_: "switch on disabled")
+    monkeypatch.setattr(bus_lock, "end_programs", lambda *_: found)
+    monkeypatch.setattr(bus_lock, "marked_processes", lambda name: [8, 7] if name == "jointctl-bus-" else [])
+    assert stop_module.stop(stopped_file, Output(quiet=True)) == 0
+    assert ("; process 7, 8 controls another bus, and goes on" in capsys.readouterr().err) is not found
+
+
 @pytest.mark.parametrize(("state", "error"), [("operation enabled", DeviceError), ("switch on disabled", DataError)])
 def test_a_full_disk_behind_its_output_does_not_hide_it(
     stopped_file: Path, monkeypatch: pytest.MonkeyPatch, state: str, error: type[Exception]
