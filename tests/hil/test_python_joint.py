@@ -264,6 +264,24 @@ def test_a_program_that_goes_on_after_a_fault_learns_that_its_drive_may_be_on(be
     assert "left" not in ended.err.split()
 
 
+ANOTHER = """
+import os
+another = "import sys, time; print('another', file=sys.stderr, flush=True); time.sleep(60.0)"
+os.execv(sys.executable, [sys.executable, "-c", another])
+"""
+
+
+@pytest.mark.parametrize("body", ["", "joint.enable()\n"], ids=["commissioned", "enabled"])
+def test_a_program_whose_process_becomes_another_one_leaves_the_joint_and_its_bus(bench: Any, body: str) -> None:
+    """The loop took it for its supervisor, whose number it has: the bus stayed locked, the last records were lost."""
+    config = bench.with_joint()
+    program = bench.program(UNLEFT.format(body=body + ANOTHER)).saw("another")
+    eventually(lambda: bench.run("run", config, "--dry-run", "-q").code == 0)
+    assert bench.disabled()
+    assert bool(list(bench.folder.glob("**/*.tail.mcap"))) == bool(body)
+    program.end()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -20,6 +20,7 @@ from jointctl.drivers.elmo.dialogue import SERVO_ON, motor_fault_text, usb_seria
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import command_time_s
 from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.drivers.port_users import keep_from_forks
 from jointctl.firmware_py.cycle import WORDS, Histogram, Word
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.configuration.config import Config
@@ -95,7 +96,8 @@ class GuardHandle:
 
     def __init__(self, drive: ElmoSection, loop: LoopHandle) -> None:
         self._ended = False
-        self._control, theirs = socket.socketpair()
+        ours, theirs = socket.socketpair()
+        self._control = keep_from_forks(ours)
         supervisor, ended = os.pidfd_open(os.getpid()), os.pidfd_open(loop.pid)
         passed = (theirs.fileno(), loop.block.fd, supervisor, ended)
         order = GuardOrder(

@@ -290,9 +290,11 @@ class LineGuard:
     # --- words from outside ---
 
     def _take_word(self) -> None:
-        """The end of the connection without a word is the supervisor's end, which its pidfd tells as well."""
+        """The end of the connection without a word is the supervisor's, also where its process goes on (exec)."""
         message = received_line(self._control, HEARD_S)
-        if message is not None:
+        if message is None:
+            self._dead.add(self._order.supervisor_pidfd)
+        else:
             self._state = str(message.get("state", "unknown: no word"))
 
     def _take_caller(self) -> None:

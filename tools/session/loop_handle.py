@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointctl.drivers.errors import MotionFault
+from jointctl.drivers.port_users import keep_from_forks
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.libc import NANOSECONDS
@@ -56,8 +57,11 @@ class LoopHandle:
         self._after_end = config.drive.when_the_loop_ends
         self._processor = config.loop.cpu
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
+        theirs, ours = os.pipe()
+        self._alive = keep_from_forks(os.fdopen(ours, "wb"))  # closed with this process, and by exec
         order = LoopOrder(
             supervisor_pid=os.getpid(),
+            supervisor_fd=theirs,
             block_fd=self.block.fd,
             table_rows=self.block.tables.shape[1],
             axes=self.block.axes,
@@ -76,12 +80,13 @@ class LoopHandle:
                 for axis in sorted(set(first_on_bus(joints)) - {0})
             ),
         )
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "jointctl.tools.session.loop_process", order.argument()],
-            pass_fds=(self.block.fd, *marker_fds),
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # keys that a terminal turns into signals are not for the loop
-        )
+        with open(theirs, "rb"):
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "jointctl.tools.session.loop_process", order.argument()],
+                pass_fds=(theirs, self.block.fd, *marker_fds),
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,  # keys that a terminal turns into signals are not for the loop
+            )
 
     def __enter__(self) -> LoopHandle:
         return self
@@ -95,6 +100,7 @@ class LoopHandle:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        self._alive.close()
         let_run(self._allowed)  # not before: until then the processor is the loop's
 
     @property

@@ -11,6 +11,7 @@ import json
 import math
 import mmap
 import os
+import select
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -169,6 +170,7 @@ def quantile_s(histogram: np.ndarray, quantile: float) -> float:
 @dataclass(frozen=True)
 class LoopOrder:
     supervisor_pid: int
+    supervisor_fd: int  # of a pipe, whose other end the supervisor has
     block_fd: int
     table_rows: int
     kind: str  # drive.kind
@@ -186,3 +188,9 @@ class LoopOrder:
 
     def argument(self) -> str:
         return json.dumps(asdict(self))
+
+    def supervisor_gone(self) -> bool:
+        """It has ended, or its process has become another program's (exec), which keeps the number."""
+        poll = select.poll()
+        poll.register(self.supervisor_fd, 0)
+        return os.getppid() != self.supervisor_pid or bool(poll.poll(0))

@@ -73,14 +73,14 @@ def run(order: LoopOrder) -> int:
         with cores_awake():  # where that is refused, `doctor` says so
             block.words[Word.READY] = 1
             while block.words[Word.GO] == 0:
-                if os.getppid() != order.supervisor_pid:
+                if order.supervisor_gone():
                     return 1
                 if block.words[Word.LISTEN] == 0:  # commissioning, its proof of the watchdog, the user's thinking time
                     ready.flush()
                 time.sleep(_POLL_S)
             ready.go()
             block.words[Word.ENDED] = 1
-    if os.getppid() != order.supervisor_pid:
+    if order.supervisor_gone():
         save_tails(block, [Path(path) for path in order.tail_paths])
     return 0
 

@@ -93,7 +93,7 @@ def compiled_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     call = compiled_call(block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
     while block.words[Word.BUS] == 0:
-        if os.getppid() != order.supervisor_pid:
+        if order.supervisor_gone():
             raise BusError("the supervising process went before the bus was there")
         time.sleep(_POLL_S)
     with contextlib.ExitStack() as stack:

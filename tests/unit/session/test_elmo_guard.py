@@ -280,6 +280,15 @@ def test_one_of_both_may_die_the_other_is_at_work(world: Guarded, first: str) ->
     assert world.told() == SWITCH_OFF
 
 
+def test_a_supervisor_whose_process_has_become_another_program_counts_as_dead(world: Guarded) -> None:
+    """`os.execv` in a program with a `Joint`: the number of its process lives on, and no one is at work there."""
+    world.after(0.5, world.ours.close)
+    world.after(1.0, lambda: world.dies("loop"))
+    assert world.run() == 0
+    assert world.since_s() == 1.0
+    assert world.opened == [(world.order.port, 115_200)]
+
+
 def test_a_drive_that_was_not_reached_is_tried_until_it_is_off(
     world: Guarded, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -346,7 +346,7 @@ def order(interface: str, period_ns: int, block: SharedBlock) -> str:
     channel = "no-such-bus"
     fd = os.dup(block.fd)
     timing = period_ns, 600_000, None, None
-    return LoopOrder(os.getpid(), fd, 1, "canopen", interface, channel, *timing).argument()
+    return LoopOrder(os.getpid(), fd, fd, 1, "canopen", interface, channel, *timing).argument()
 
 
 @pytest.mark.parametrize(
@@ -393,11 +393,17 @@ def test_the_bus_is_opened_when_the_supervisor_has_it_and_not_before(
     assert len(waits) == 3
 
 
+@pytest.mark.parametrize("how", ["its process has ended", "its process has become another program"])
 def test_a_loop_whose_supervisor_goes_before_the_bus_is_there_ends(
-    block: SharedBlock, monkeypatch: pytest.MonkeyPatch
+    block: SharedBlock, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
-    given = replace(LoopOrder(**json.loads(order("jointctl", 1_000_000, block))), supervisor_pid=-1)
+    theirs, ours = os.pipe()
+    if how == "its process has become another program":
+        os.close(ours)
+    pid = -1 if how == "its process has ended" else os.getppid()
+    given = LoopOrder(**json.loads(order("jointctl", 1_000_000, block)))
+    given = replace(given, supervisor_pid=pid, supervisor_fd=theirs)
     with pytest.raises(BusError, match="before the bus was there"), loops.compiled_loop(given, block):
         pass
 
