@@ -282,6 +282,32 @@ def test_a_program_whose_process_becomes_another_one_leaves_the_joint_and_its_bu
     program.end()
 
 
+STANDS = """
+import time
+from jointctl.tools.session import control, loop_handle
+
+control.STOOD_S = 0.5
+wait_ready = loop_handle.LoopHandle.wait_ready
+
+def standing(loop, *arguments):
+    time.sleep({stood_s})
+    wait_ready(loop, *arguments)
+
+loop_handle.LoopHandle.wait_ready = standing
+"""
+
+
+@pytest.mark.parametrize(("stood_s", "refused"), [(0.6, True), (0.1, False)])
+def test_a_yes_does_not_count_after_a_standstill(bench: Any, stood_s: float, refused: bool) -> None:
+    """Stopped by Ctrl-Z, or with its computer asleep, a run that was agreed to moved the joint when it went on."""
+    bench.with_joint(stream__client_timeout_s=3.0)
+    program = STANDS.format(stood_s=stood_s) + PROGRAM.format(body="joint.stop()", approve="")
+    ended = bench.program(program).finished(60.0)
+    assert ("stood still for 1 s after the motion was agreed to" in ended.err) is refused
+    assert ("enabled" in ended.err.split()) is not refused
+    assert bench.disabled()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -14,7 +14,8 @@ from types import FrameType
 
 from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
-from jointctl.drivers.errors import UsageError
+from jointctl.drivers.errors import MotionFault, UsageError
+from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -25,6 +26,7 @@ from jointctl.tools.output import Output
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STOP_COMMAND = "jointctl stop"
 AGAIN_S = 0.05
+STOOD_S = 30.0  # between two looks after a yes: this program was stopped (Ctrl-Z), or the computer slept
 _ESCALATION = (StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF)
 
 
@@ -42,6 +44,7 @@ class StopSignals:
         self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
         self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
         self._again = False  # the next signal is no new one
+        self.looked_ns: int | None = None  # by `now_ns`; from the user's yes until the loop is let go
         self._command = threading.Lock()
 
     @property
@@ -91,6 +94,18 @@ class StopSignals:
         """`KeyboardInterrupt` once a stop was asked for: between two steps before the joint may move."""
         if self.count or self.commanded_ns:
             raise KeyboardInterrupt
+        self.look()
+
+    def look(self) -> None:
+        """`MotionFault` where a yes is out of date: who goes on after a standstill moves when no one expects it."""
+        if self.looked_ns is None:
+            return
+        before_ns, self.looked_ns = self.looked_ns, now_ns()
+        if (stood_s := (self.looked_ns - before_ns) * 1e-9) > STOOD_S:
+            raise MotionFault(
+                f"this program or the computer stood still for {stood_s:.0f} s after the motion was agreed to",
+                "nothing has moved: start again",
+            )
 
     @contextmanager
     def held(self) -> Iterator[None]:

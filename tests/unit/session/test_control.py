@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -19,7 +19,7 @@ import pytest
 
 from jointctl.drivers import bus_lock, stop_note
 from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name, wait_for_answers
-from jointctl.drivers.errors import BusError, DataError, JointctlError
+from jointctl.drivers.errors import BusError, DataError, JointctlError, MotionFault
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import Fault, StopRequest
@@ -86,6 +86,18 @@ def test_asking_again_asks_for_more(count: int, commanded: bool, request_: StopR
     if count or commanded:
         with pytest.raises(KeyboardInterrupt):
             signals.leave_if_asked()
+
+
+@pytest.mark.parametrize(("agreed", "stood_s", "refused"), [(True, 31, True), (True, 29, False), (False, 31, False)])
+def test_after_a_yes_a_standstill_is_a_reason_to_leave(
+    monkeypatch: pytest.MonkeyPatch, agreed: bool, stood_s: int, refused: bool
+) -> None:
+    signals, times_ns = StopSignals(), iter([20 * 10**9, (20 + stood_s) * 10**9])
+    monkeypatch.setattr(control, "now_ns", lambda: next(times_ns))
+    signals.looked_ns = 0 if agreed else None
+    signals.leave_if_asked()
+    with pytest.raises(MotionFault, match="stood still for 31 s") if refused else nullcontext():
+        signals.leave_if_asked()
 
 
 def test_the_first_signal_is_the_one_that_is_named() -> None:
