@@ -394,8 +394,9 @@ class Session:
             text = self._kind.fault_text(config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
+        summary = summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC)
         return RunResult(
-            summary=summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC),
+            summary=replace(summary, fault=fault.name),
             records=records,
             histograms=loop.block.histograms.copy(),
             fault=fault,

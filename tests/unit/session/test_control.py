@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -22,7 +23,8 @@ from jointctl.drivers.bus_lock import BusLock, StopCall, end_programs, lock_name
 from jointctl.drivers.errors import BusError, DataError, JointctlError, MotionFault
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.session import control
 from jointctl.tools.session.control import (
@@ -37,6 +39,7 @@ from jointctl.tools.session.control import (
     stop_signals,
     stop_within_s,
 )
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.session import NOTED_WITHIN_NS, Session, came_before
 from jointctl.tools.verbs.start import Interruption
 
@@ -521,3 +524,41 @@ def test_an_interruption_that_python_has_dropped_is_not_lost(
             raise AssertionError("the run began")
     finally:
         signal.signal(number, before)
+
+
+class Kept(list[Any]):
+    """Records of a run."""
+
+    def records(self) -> Any:
+        return self[0]
+
+
+@pytest.mark.parametrize(("commanded_ns", "fault"), [(0, "DRIVE_NOT_ENABLED"), (10**10, "NONE")])
+def test_what_a_stop_did_to_the_drive_is_no_fault_in_the_table_either(commanded_ns: int, fault: str) -> None:
+    """It stood there in red, beside the words that the run was stopped."""
+    records = np.zeros(100, dtype_of(LogRecord)).view(np.recarray)
+    records.fault, records.phase = Fault.DRIVE_NOT_ENABLED, AxisPhase.DISABLING
+    records.time_ns = 10**10 + np.arange(len(records)) * 1_000_000
+    state = SimpleNamespace(fault_drive_error=0, fault_encoder_error=0, fault_slot_ns=0, fault_value=0.0)
+    block = SimpleNamespace(state=[state], histograms=np.zeros((4, 9), int), port=[SimpleNamespace(last_errno=0)])
+    loop = SimpleNamespace(
+        block=block, verdict=lambda: (Fault.DRIVE_NOT_ENABLED, 0.0), stop_requested=True, lost_records=0
+    )
+    words = FaultText("it is off", "its enable input", "check it")
+    watch: Any = SimpleNamespace(
+        loop=loop,
+        config=load_config(shipped_config("virtual")),
+        kept=Kept([records]),
+        stopped_by="jointctl stop",
+        log=SimpleNamespace(is_in_place=lambda: True),
+        temperature=SimpleNamespace(values_degC=[]),
+        joint=SimpleNamespace(log_path=Path("x.mcap"), name=""),
+        around=SimpleNamespace(
+            signals=SimpleNamespace(commanded_ns=commanded_ns),
+            bus_watch=SimpleNamespace(explained=lambda fault, text, errno: text),
+        ),
+    )
+    session = Session.__new__(Session)
+    session._kind = SimpleNamespace(fault_text=lambda *_: words, load_row=lambda share: ("bus load", ""))
+    result = session._result(watch, Mock(), "switch on disabled", 0.1)
+    assert (result.summary.fault, result.fault.name) == (fault, fault)
