@@ -344,6 +344,28 @@ def find_outliers(problem: Problem, threshold: float) -> tuple[np.ndarray, np.nd
     return out, score
 
 
+def points_beyond(problem: Problem, beyond: np.ndarray, threshold: float) -> np.ndarray:
+    """By how many standard deviations each of `beyond` (bool (N,)) misses the curve of the others; empty: by chance.
+
+    Chow's test of a few points that were not in the fit, at 1 %: too few for a stage of their own, they would bend
+    the whole curve, or be taken for single outliers.  The others' own outliers (`threshold` of `find_outliers`) do not
+    count.
+    """
+    low = problem.part(~beyond)
+    low = low.part(~find_outliers(low, threshold)[0])
+    free, count = len(low.x) - low.form.parameters, int(np.count_nonzero(beyond))
+    if free < low.form.parameters:
+        return np.zeros(0)
+    alone, rest = project(low), problem.part(beyond)
+    both = replace(
+        low, x=np.append(low.x, rest.x), y_Nm=np.append(low.y_Nm, rest.y_Nm), weight=np.append(low.weight, rest.weight)
+    )
+    variance = max(alone.rss / free, (1e-6 * float(np.max(np.abs(problem.y_Nm)))) ** 2)
+    if (project(both).rss - alone.rss) / count <= variance * float(stats.f.ppf(0.99, count, free)):
+        return np.zeros(0)
+    return np.asarray((rest.y_Nm - alone.torque_Nm(rest.x)) / np.sqrt(variance))
+
+
 def fold_numbers(problem: Problem, folds: int, seed: int) -> np.ndarray:
     """Fold of each point (N,): speeds are dealt at random; repeats of a speed stay together, as they are no news."""
     speeds, which = np.unique(problem.x, return_inverse=True)

@@ -93,7 +93,7 @@ def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
     keep &= ~zero
     never = keep & ~data.settled
     if never.any():
-        notes.append(f"{_lines(data.line[never])}: never settled: not used")
+        notes.append(f"{_lines(data.line[never])}: did not settle: not used")
     index = np.flatnonzero(keep)
     if ordered and np.any(np.diff(data.velocity_radps[index]) < 0.0):
         notes.append("the points were not in order of velocity: sorted")

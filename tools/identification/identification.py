@@ -25,6 +25,7 @@ from jointctl.tools.identification.fit import (
     make_problem,
     noise_exponent,
     noise_of,
+    points_beyond,
     polish,
     project,
     uncertainty,
@@ -350,10 +351,27 @@ def _points(
     word = "positive" if sign > 0 else "negative"
     chosen = data.direction(sign)
     chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
-    problem = make_problem(
-        first, sign * data.velocity_radps[chosen], sign * data.motor_torque_Nm[chosen], options.knee_radps,
-        (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
-    )  # fmt: skip
+
+    def problem_of(points: np.ndarray) -> Problem:
+        return make_problem(
+            first, sign * data.velocity_radps[points], sign * data.motor_torque_Nm[points], options.knee_radps,
+            (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
+        )  # fmt: skip
+
+    problem = problem_of(chosen)
+    beyond = problem.x * problem.top_radps > options.knee_radps
+    bent = np.zeros(0)
+    few = options.model == "auto" and not first.cubic and 0 < np.count_nonzero(beyond) < MIN_PER_STAGE
+    if few and options.outlier_threshold > 0.0:
+        bent = points_beyond(problem, beyond, options.outlier_threshold)
+    if len(bent):
+        warnings.append(
+            f"{len(bent)} points beyond the knee (={options.knee_radps / DEGREE:.4g} deg/s) at {word} velocity do not "
+            f"continue the curve below it, {np.max(np.abs(bent)):.1f} standard deviations off: not used, and the model "
+            f"ends there; measure at least {MIN_PER_STAGE} of them, or set --knee or --model"
+        )
+        bent_index, chosen = chosen[beyond], chosen[~beyond]
+        problem = problem_of(chosen)
     shape, exponent = noise
     if shape is not None and exponent:
         problem = with_noise(replace(shape, problem=problem), exponent)
@@ -372,6 +390,8 @@ def _points(
     if options.search_knee and first.cubic and out.any():
         problem = replace(problem, knee=project(problem, search_knee=True).knee)
     _stage_check(data, problem, word)
+    if len(bent):
+        return _Points(problem, chosen[~out], np.append(chosen[out], bent_index), np.append(score[out], bent))
     return _Points(problem, chosen[~out], chosen[out], score[out])
 
 

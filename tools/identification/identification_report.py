@@ -100,7 +100,7 @@ def left_out_text(found: Identification) -> str:
     if not out.outliers + out.unsettled:
         return "no measured point was left out"
     return (
-        f"left out: {out.outliers} outliers, {out.unsettled} never settled, {out.error_share:.0%} of the squared "
+        f"left out: {out.outliers} outliers, {out.unsettled} not settled, {out.error_share:.0%} of the squared "
         f"error; RMSE {1e3 * found.rmse_Nm:.4g} mNm without them, {1e3 * out.rmse_with_Nm:.4g} with them"
     )
 
@@ -188,7 +188,7 @@ def fit_figure(
         if outliers is not None and len(outliers):
             _points(axes[0], data, outliers, "outlier, not used", RED, "x")
         if len(unsettled):
-            _points(axes[0], data, unsettled, "never settled, not used", GREY, "^")
+            _points(axes[0], data, unsettled, "not settled, not used", GREY, "^")
         for axis in axes[1:]:
             axis.axhline(0.0, color=GREY, linewidth=0.8)
         axes[0].set_ylabel("friction at the motor [Nm]")

@@ -95,7 +95,7 @@ def test_points_that_never_settled_and_zero_speed_are_named_and_not_used(tmp_pat
     lines = [*rows(), row(1.9, 0.5, settled=0), row(0.0, 0.01)]
     data = read_friction_data(write_sweep(tmp_path, lines))
     assert len(data.direction(1)) == 13
-    assert any("line 28: never settled" in note for note in data.notes)
+    assert any("line 28: did not settle" in note for note in data.notes)
     assert any("line 29: zero velocity" in note for note in data.notes)
 
 

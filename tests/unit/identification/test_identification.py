@@ -66,7 +66,7 @@ def test_what_was_left_out_is_reported_with_its_share_of_the_error():
         squared
     )
     assert out["error_share"] == pytest.approx(2 * 0.08**2 / (squared + 2 * 0.08**2), rel=0.1)
-    assert "2 outliers, 1 never settled" in left_out_text(found)
+    assert "2 outliers, 1 not settled" in left_out_text(found)
     assert left_out_text(identify_friction(paper_data(3), QUICK)) == "no measured point was left out"
 
 
@@ -160,6 +160,29 @@ def test_auto_leaves_out_a_model_that_the_data_do_not_reach(beyond, left_out):
     found = identify_friction(data, Options(model="auto", folds=4, swarm=QUICK.swarm))
     assert [f"{beyond} beyond, too few" in note for note in found.notes] == ([True] if left_out else [])
     assert ("multi-stage" in found.held_out_by_model_Nm) is not left_out
+
+
+@pytest.mark.parametrize("bends", [True, False])
+def test_few_points_beyond_the_knee_neither_bend_the_curve_nor_count_as_noise(bends):
+    """A quick sweep of a joint up to 52 deg/s: Coulomb and viscous friction were off by several intervals."""
+    speeds = np.concatenate([np.linspace(0.3, 39.0, 24), [43.0, 47.0, 52.0]]) * DEGREE
+    data = paper_data(0, np.concatenate([-speeds[::-1], speeds]))
+    u, sign = np.abs(data.velocity_radps) / DEGREE, np.sign(data.velocity_radps)
+    straight = np.where(
+        sign > 0.0,
+        0.11985 + (0.14537 - 0.11985) * np.exp(-u / 1.2301) + 0.0026518 * u,
+        0.1063 + (0.1575 - 0.1063) * np.exp(-u / 2.887) + 0.002475 * u,
+    )
+    truth = friction_curve_Nm(paper_friction(), data.velocity_radps) if bends else sign * straight
+    data.motor_torque_Nm[:] = truth + 2e-4 * np.random.default_rng(5).standard_normal(len(u))
+    found = identify_friction(data, Options(model="auto", folds=4, swarm=QUICK.swarm))
+    assert ["beyond the knee" in warning for warning in found.warnings] == [True, True] * bends
+    assert found.noise_exponent == 0.0
+    for direction, tc_Nm, tv in (("positive", 0.11985, 0.0026518), ("negative", 0.1063, 0.002475)):
+        branch = found.branches[direction]
+        assert (branch.coulomb_Nm, branch.viscous_Nmspr) == pytest.approx((tc_Nm, tv / DEGREE), rel=0.01)
+        assert branch.max_radps == pytest.approx((39.0 if bends else 52.0) * DEGREE)
+        assert len(found.directions[direction].outliers) == 3 * bends
 
 
 def test_a_searched_knee_is_told_and_not_worse():
