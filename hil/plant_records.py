@@ -73,7 +73,7 @@ class PlantSettings:
 
     step_s: float = number(50e-6, 1e-6, 1e-3)
     initial_position_rad: float = number(0.0, -1e4, 1e4)
-    inertia_kgm2: float = number(2.1, 1e-3, 1e4)
+    inertia_kgm2: float = number(2.1, 1e-6, 1e4)
     reduction_ratio: float = number(121.0, 1.0, 1000.0)
     torque_constant_NmpA: float = number(0.1, 1e-4, 100.0)  # motor side; not given in the paper
     current_limit_A: float = number(100.0, 1e-3, 1e4)
@@ -91,7 +91,7 @@ class PlantSettings:
     bristle_stiffness_Nmprad: float = number(8e4, 1.0, 1e7)
     bristle_damping_Nmspr: float = number(200.0, 0.0, 1e5)
     flexible: bool = False
-    motor_side_inertia_kgm2: float = number(1.2, 1e-3, 1e4)
+    motor_side_inertia_kgm2: float = number(1.2, 1e-6, 1e4)
     reducer_stiffness_Nmprad: float = number(1.3e4, 1.0, 1e8)
     reducer_damping_Nmspr: float = number(5.0, 0.0, 1e5)
     reducer_knees_Nm: tuple[float, ...] = ()

@@ -173,22 +173,29 @@ def device_settings(config: Config) -> DeviceSettings:
         torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
-        **_drive_loops(drive),
+        **_drive_loops(drive, config.joint.inertia_kgm2),
     )
 
 
-def _drive_loops(drive: CanopenSection) -> dict[str, Any]:
-    """Its own loops in CSP and CSV, with the gains that the configuration knows; else those of `DeviceSettings`."""
+def _drive_loops(drive: CanopenSection, inertia_kgm2: float) -> dict[str, Any]:
+    """Its own loops: the gains that the configuration has, else those of `DeviceSettings`, which suit 2.1 kg m2.
+
+    The velocity loop brakes as well, in every mode: a real drive's was tuned to its joint's inertia.
+    """
+    suited = inertia_kgm2 / PlantSettings.inertia_kgm2
+    gains: dict[str, Any] = {
+        name: getattr(DeviceSettings, name) * suited for name in ("velocity_gain_Nmspr", "velocity_integral_Nmprad")
+    }
     cascade = drive.cascade
     if cascade is None:
-        return {}
-    gains = {
+        return gains
+    given = {
         "velocity_gain_Nmspr": cascade.velocity_gain_Nmspr,
         "velocity_integral_Nmprad": cascade.velocity_integral_Nmprad,
         "position_gain_ps": cascade.position_gain_ps if drive.mode == "csp" else None,
     }
-    known = {name: gain for name, gain in gains.items() if gain is not None}
-    return {**known, "velocity_feed": 1.0 - cascade.velocity_share, "loop_rate_Hz": cascade.loop_rate_Hz}
+    gains |= {name: gain for name, gain in given.items() if gain is not None}
+    return {**gains, "velocity_feed": 1.0 - cascade.velocity_share, "loop_rate_Hz": cascade.loop_rate_Hz}
 
 
 def _second_encoder(config: Config) -> dict[str, Any]:

@@ -559,7 +559,7 @@ class Virtual(Section):
     bristle_stiffness_Nmprad: Annotated[float, between(1.0, 1e7)] = 8e4  # of friction_kind lugre
     bristle_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0  # of friction_kind lugre
     flexible: bool = False  # motor and joint as two masses with the reducer between
-    motor_side_inertia_kgm2: Annotated[float, between(1e-3, 1e4)] = 1.2  # at the joint; of joint.inertia_kgm2
+    motor_side_inertia_kgm2: Annotated[float, between(1e-6, 1e4)] = 1.2  # at the joint; of joint.inertia_kgm2
     reducer_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 1.3e4  # with flexible = true
     reducer_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 5.0  # with flexible = true
     reducer_knees_Nm: PerKnee = ()  # transmitted torques beyond which the reducer is stiffer

@@ -34,8 +34,8 @@ from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import approach_s, trajectory_table
 from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section, Sequence
-from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import VIRTUAL, load, problems
+from jointctl.tools.virtual_joint import device_settings, plant_settings
+from tests.configurations import CONFIGS, VIRTUAL, load, problems
 from tests.sessions import constants_of
 
 NO_TABLE = np.zeros((1, 5))
@@ -191,6 +191,17 @@ def test_plant_settings_are_accepted_by_the_plant() -> None:
     assert constants[0].positive_factor == pytest.approx(121.0 * 1.1)
     assert state[0].joint_position_rad == 0.1
     assert settings["current_lag_s"] == 0.5e-3
+
+
+@pytest.mark.parametrize("inertia_kgm2", [6e-4, 2.1, 40.0])
+def test_the_virtual_drives_velocity_loop_suits_the_inertia_of_its_joint(tmp_path: Path, inertia_kgm2: float) -> None:
+    """The gains of 2.1 kg m2 left 40 kg m2 with a damping of 0.16: it swung in `sweep`, and in stops."""
+    settings = device_settings(load(tmp_path, "inertia_kgm2 = [0-9.]+", f"inertia_kgm2 = {inertia_kgm2}"))
+    assert settings.velocity_gain_Nmspr == pytest.approx(200.0 / 2.1 * inertia_kgm2)
+    assert settings.velocity_integral_Nmprad == pytest.approx(1e4 / 2.1 * inertia_kgm2)
+    text = (CONFIGS / "csp.toml").read_text()
+    given = load(tmp_path, "inertia_kgm2 = [0-9.]+", f"inertia_kgm2 = {inertia_kgm2}", text)
+    assert device_settings(given).velocity_gain_Nmspr == 200.0
 
 
 def test_a_table_trajectory_is_read_and_checked(tmp_path: Path) -> None:

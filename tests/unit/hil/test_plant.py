@@ -709,7 +709,7 @@ def test_encoder_noise_is_normal_seeded_and_off_by_default():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"inertia_kgm2": 0.0}, r"inertia_kgm2 (=0.0) must be a number in [0.001..10000]"),
+        ({"inertia_kgm2": 0.0}, r"inertia_kgm2 (=0.0) must be a number in [1e-06..10000]"),
         ({"inertia_kgm2": math.nan}, r"inertia_kgm2 (=nan) must be"),
         ({"inertia_kgm2": "2.1"}, r"inertia_kgm2 (=2.1) must be a number"),
         ({"step_s": 2e-3}, r"step_s (=0.002) must be a number in [1e-06..0.001]"),
@@ -753,7 +753,7 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(settings, mes
 @pytest.mark.parametrize(
     "settings",
     [
-        {"inertia_kgm2": 1e-3}, {"command_delay_s": 0.05115}, {"friction_kind": 3, "bristle_stiffness_Nmprad": 2.5e5},
+        {"inertia_kgm2": 1e-6}, {"command_delay_s": 0.05115}, {"friction_kind": 3, "bristle_stiffness_Nmprad": 2.5e5},
         {"flexible": True, "reducer_stiffness_Nmprad": 1.6e4},
         {"torque_ripple_Nm": [1.0] * 4, "torque_ripple_per_motor_turn": [1.0] * 4}, R1,
     ],
