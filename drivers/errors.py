@@ -8,6 +8,7 @@ or empty.
 from __future__ import annotations
 
 import errno
+import math
 import re
 from typing import ClassVar
 
@@ -54,6 +55,14 @@ def shortened(value: str) -> str:
     if len(value) <= LONGEST_VALUE:
         return value
     return f"{value[: LONGEST_VALUE - _TAIL - 3]}...{value[-_TAIL:]}"
+
+
+def text_Nm(torque_Nm: float, decimals: int = 1, greatest_Nm: float | None = None) -> str:
+    """A torque with its unit: so many decimals, more where it, or the greatest of a row, is below 1 Nm."""
+    size = abs(torque_Nm if greatest_Nm is None else greatest_Nm)
+    if 1e-4 < size < 1.0:
+        decimals = max(decimals, 1 - math.floor(math.log10(size)))
+    return f"{torque_Nm:.{decimals}f} Nm"
 
 
 def message_line(text: str) -> str:

@@ -234,6 +234,8 @@ class Program:
         from jointctl.firmware_py.kernel import plain
         from jointctl.firmware_py.live_change import move_duration_s
 
+        if duration_s is not None and not 0.001 <= duration_s <= 1e5:
+            raise ConfigurationError(f"duration_s (={duration_s:g}) must be in [0.001..100000] s")
         with self._commands:
             starts_rad = self._at_rest()
             if duration_s is None:

@@ -257,8 +257,11 @@ def test_an_interruption_offers_to_go_on_only_where_a_step_was_done(
     monkeypatch.setattr(Tune, f"_step_{step}", interrupted)
     path = written(tmp_path / "joint.toml", "precise")
     output, _, err = outputs()
+    kept = tmp_path / "joint.tune" / "steps.json"
+    kept.parent.mkdir()
+    kept.write_text("{}")  # an older tune's, which --resume must not go on with
     assert tune(load_config(path), output, options=TuneOptions(lockstep=True)) == 130
-    assert ("--resume goes on" in err.getvalue()) == (tmp_path / "joint.tune" / "steps.json").exists()
+    assert ("--resume goes on" in err.getvalue()) == kept.exists()
     assert ("no step was done" in err.getvalue()) == (step == "direction")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointctl.drivers.errors import text_Nm
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm
@@ -79,7 +80,7 @@ def not_modelled(config: Config) -> list[str]:
     if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
         found.append(
             f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
-            f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
+            f"{text_Nm(step_Nm)}, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
             'it will chatter; lower kv or velocity_cutoff_Hz, or take control.velocity_filter = "kalman"'
         )
     return found

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointctl.drivers.errors import MarginError
+from jointctl.drivers.errors import MarginError, text_Nm
 from jointctl.firmware_py.states import CommandKind, ControllerKind, Encoders
 from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings, TwoMasses, loop_settings
 from jointctl.tools.analysis.margins import (
@@ -247,8 +247,8 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
         )
     if step_Nm + holding_Nm >= limit_Nm:
         raise MarginError(
-            f"the torque would chatter at its limit: one count of the encoder moves it by {step_Nm:.1f} Nm, friction "
-            f"and gravity need {holding_Nm:.1f} Nm; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
+            f"the torque would chatter at its limit: one count of the encoder moves it by {text_Nm(step_Nm)}, friction "
+            f"and gravity need {text_Nm(holding_Nm)}; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
             'an encoder with more counts, control.velocity_filter = "kalman", or lower control.velocity_cutoff_Hz, kv '
             "and observer_radps",
         )

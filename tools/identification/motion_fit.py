@@ -287,8 +287,8 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
     q, a = motion.position_rad[used], motion.acceleration_radps2[used]
     if min(np.ptp(q), np.ptp(a)) > 0.0 and abs(stats.spearmanr(q, a).statistic) > _ALONG:
         untold.append(
-            f"{name}: the acceleration goes with the angle, as in a single sine: inertia cannot be separated from "
-            "gravity or from friction that depends on the position: move at two frequencies or more"
+            f"{name}: the acceleration goes with the angle, as in a single sine: gravity, or friction that depends "
+            "on the position, may stand in for inertia beyond its interval: move at frequencies that differ more"
         )
     if motion.load_Nm is not None:
         terms |= {"load-scale", "load-coulomb", "load-viscous"}

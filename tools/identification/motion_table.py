@@ -84,7 +84,8 @@ def _parts(table: TableFile, given: ForeignFormat) -> list[tuple[str, np.ndarray
     """(name, lines (N,) bool) of each motion: where a column changes, or, if it is that of the time, goes back."""
     assert given.motion_column is not None
     if given.time_column is not None and table.column(given.motion_column) == table.column(given.time_column):
-        begins = np.diff(table.numbers(given.time_column)) < 0.0
+        stamps_s = table.timestamps_s(given.time_column)
+        begins = np.diff(table.numbers(given.time_column) if stamps_s is None else stamps_s) < 0.0
         labels: Sequence[object] = range(1, np.count_nonzero(begins) + 2)
     else:
         texts = table.texts(given.motion_column)
@@ -103,6 +104,9 @@ def _series(table: TableFile, given: ForeignFormat) -> RawMotion:
     if given.time_column is not None:
         names["time"] = given.time_column
         stamps_s = table.timestamps_s(given.time_column)
+        if stamps_s is not None and given.time_unit != "s":
+            what = f"{given.time_column} has dates or times of day"
+            raise UsageError(f"--time-unit (={given.time_unit}) is for numbers: {what}", "leave it away")
         time_s = table.numbers(given.time_column, gaps=True) if stamps_s is None else stamps_s
         time_s = (time_s - time_s[0]) * (SECONDS_PER_UNIT[given.time_unit] if stamps_s is None else 1.0)
     else:

@@ -30,15 +30,18 @@ PDO_NUMBERS = 4
 MILLI = 1e-3
 MAXON = 0xFB  # vendor of 1018:1
 
-# object, its unit as CiA 402 has it ("" = units of the drive, which its configuration decides)
+# object, its unit as CiA 402 has it; positions count as 6064 does, and so do speeds and accelerations unless the drive
+# scales them, or its maker has other units
+_POSITION, _SPEED, _RAMP = "units of 6064", "units of 6064 per s, unless scaled", "units of 6064 per s2, unless scaled"
 _LIMITS = (
-    (0x6072, 0, "permille of rated torque"), (0x6073, 0, "permille of rated current"), (0x607F, 0, ""),
-    (0x6080, 0, "r/min"), (0x607D, 1, ""), (0x607D, 2, ""), (0x6065, 0, ""), (0x6066, 0, "ms"),
-    (0x60C5, 0, ""), (0x60C6, 0, ""), (0x6085, 0, ""), (0x6087, 0, "permille of rated torque per s"),
+    (0x6072, 0, "permille of rated torque"), (0x6073, 0, "permille of rated current"), (0x607F, 0, _SPEED),
+    (0x6080, 0, "r/min"), (0x607D, 1, _POSITION), (0x607D, 2, _POSITION), (0x6065, 0, _POSITION), (0x6066, 0, "ms"),
+    (0x60C5, 0, _RAMP), (0x60C6, 0, _RAMP), (0x6085, 0, _RAMP), (0x6087, 0, "permille of rated torque per s"),
 )  # fmt: skip
 _PRESENT = (
-    (0x6064, 0, ""), (0x606C, 0, ""), (0x6077, 0, "permille of rated torque"), (0x6078, 0, "permille of rated current"),
-    (0x6079, 0, "mV"), (0x60F4, 0, ""), (0x6071, 0, "permille of rated torque"), (0x60FF, 0, ""), (0x607A, 0, ""),
+    (0x6064, 0, "counts, unless scaled"), (0x606C, 0, _SPEED), (0x6077, 0, "permille of rated torque"),
+    (0x6078, 0, "permille of rated current"), (0x6079, 0, "mV"), (0x60F4, 0, _POSITION),
+    (0x6071, 0, "permille of rated torque"), (0x60FF, 0, _SPEED), (0x607A, 0, _POSITION),
 )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, text_Nm
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.analysis.margin_gate import passes
@@ -198,7 +198,7 @@ class CheckMotion:
             *joint_lines(report),
             f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
             f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
-            f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond "
+            f"limits     {text_Nm(plan.torque_Nm)}, {plan.velocity_radps:.2f} rad/s; it is braked beyond "
             f"{plan.reach_rad:.2g} rad to either side: keep it free and unloaded, a hand on the emergency stop",
             "watch      which way it turns first: it must be the one that you call positive",
             *remark_lines(report.remarks),
@@ -405,7 +405,7 @@ def _standing(
     motion: Motion, law: str, other: str, threshold_rad: float, other_moved: bool, numbers: dict[str, Any]
 ) -> Finding:
     reading = f"the reading of [{law}] stood still (within {threshold_rad * 1e3:.2g} mrad)"
-    reading += f" at up to {motion.torque_max_Nm:.1f} Nm"
+    reading += f" at up to {text_Nm(motion.torque_max_Nm)}"
     if other_moved:
         remedy = f"[{law}] is dead or its cable, object or node is wrong: [{other}] moved"
         return Finding("motion", PROBLEM, f"{reading}, that of [{other}] moved", remedy, numbers)
@@ -476,14 +476,13 @@ _LOAD_REMEDY = (
 
 
 def _loaded(motion: Motion, numbers: dict[str, Any]) -> Finding:
-    text = (
-        f"something moved the joint against the torque, {_way(motion)}, and it stood at {abs(motion.held_Nm):.1f} Nm: "
-    )
+    held = text_Nm(abs(motion.held_Nm))
+    text = f"something moved the joint against the torque, {_way(motion)}, and it stood at {held}: "
     return Finding("load", PROBLEM, f"{text}a load or an end stop; no direction can be judged", _LOAD_REMEDY, numbers)
 
 
 def _came_to_stand(motion: Motion) -> Finding:
-    text = f"the joint, or its reading, came to stand at up to {motion.torque_max_Nm:.1f} Nm: "
+    text = f"the joint, or its reading, came to stand at up to {text_Nm(motion.torque_max_Nm)}: "
     text += "a load, an end stop, more friction than configured, or the encoder"
     return Finding("load", PROBLEM, text, f"{_LOAD_REMEDY}; the encoder's cable")
 
@@ -521,13 +520,13 @@ def _measured_torque(ratio: float) -> Finding:
 
 
 def _friction(motion: Motion, plan: CheckPlan) -> Iterator[Finding]:
-    text = f"it began to move at {motion.break_away_Nm:.1f} Nm{' beside gravity' if plan.gravity_Nm else ''}"
+    text = f"it began to move at {text_Nm(motion.break_away_Nm)}{' beside gravity' if plan.gravity_Nm else ''}"
     numbers = {"break_away_Nm": motion.break_away_Nm}
     static_Nm = plan.static_friction_Nm
     if not static_Nm:
         yield Finding("friction", OK, text, "", numbers)
     elif 1.0 / FRICTION_FACTOR <= motion.break_away_Nm / static_Nm <= FRICTION_FACTOR:
-        yield Finding("friction", OK, f"{text}; [friction] says {static_Nm:.1f} Nm", "", numbers)
+        yield Finding("friction", OK, f"{text}; [friction] says {text_Nm(static_Nm)}", "", numbers)
     else:
         remedy = "joint.torque_constant_NmpA and its ampere, joint.reduction_ratio, units of [friction]; then sweep"
-        yield Finding("friction", NOTE, f"{text}; [friction] says {static_Nm:.1f} Nm", remedy, numbers)
+        yield Finding("friction", NOTE, f"{text}; [friction] says {text_Nm(static_Nm)}", remedy, numbers)

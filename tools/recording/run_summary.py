@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import DataError
+from jointctl.drivers.errors import DataError, text_Nm
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
@@ -211,7 +211,9 @@ def summary_table(summary: RunSummary) -> Table:
     for name, key in TORQUES.items():
         torque: Range | None = getattr(summary, key)
         if torque is not None and (torque.least, torque.greatest) != (0.0, 0.0):  # zero: the law has no such part
-            table.add_row(name, f"{torque.least:.2f} .. {torque.greatest:.2f} Nm")
+            greatest_Nm = max(-torque.least, torque.greatest)
+            least, most = (text_Nm(end, 2, greatest_Nm) for end in (torque.least, torque.greatest))
+            table.add_row(name, f"{least.removesuffix(' Nm')} .. {most}")
     for name, key in (*TIMES.items(), ("SYNC of all buses", "sync_spread")):
         times: TimeSummary | None = getattr(summary, key)
         if times is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jointctl.drivers.canopen.cia import state_text
+from jointctl.drivers.errors import text_Nm
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event
@@ -145,7 +146,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "report the run log: this should not happen with a checked configuration",
     ),
     Fault.TORQUE_SATURATED: FaultWords(
-        "the torque stayed at its limit ({value:.1f} Nm) for too long",
+        "the torque stayed at its limit ({torque} Nm) for too long",
         "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
         "turn the joint by hand with the power off, then look at the friction values",
     ),
@@ -298,7 +299,7 @@ def fault_text(
     text = row.two_encoders if two_encoders and row.two_encoders else row
     if encoder_error and row.two_encoders:
         text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
-    happened = text.happened.format(value=value, word=_word_text(value))
+    happened = text.happened.format(value=value, torque=text_Nm(value).removesuffix(" Nm"), word=_word_text(value))
     if drive_error:
         happened += f"; the drive's error code is {emergency_text(drive_error)}"
     if encoder_error:
@@ -360,7 +361,7 @@ def notice_text(notice: Notice, state: AxisState) -> str:
     """One line, with the numbers of `state` and what to do about it."""
     if notice is Notice.TORQUE_NOISE:
         return (
-            f"torque noise: the command changes by {float(state.swing.noise_told_Nm):.1f} Nm from cycle to cycle; "
+            f"torque noise: the command changes by {text_Nm(float(state.swing.noise_told_Nm))} from cycle to cycle; "
             'an encoder with more counts, control.velocity_filter = "kalman", a lower control.velocity_cutoff_Hz or '
             "lower gains (kv, observer_radps) make it quieter"
         )

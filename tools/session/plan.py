@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
-from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError
+from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.safety import ROUNDING_rad
@@ -197,7 +197,7 @@ def limits_line(limits: Limits) -> str:
     """Of the envelope of a motion that is followed under all of them."""
     return (
         f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-        f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
+        f"{limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)}, "
         f"following error {limits.following_error_max_rad:.3f} rad"
     )
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -278,7 +278,7 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     try:
         while peak_Nm < task.largest_Nm:
             found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
-            carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
+            carrier.output.note(f"  {text_Nm(peak_Nm, 2)}: coherence {found.coherence:.3f}")
             if before is not None:
                 _refuse_growth(before, found)
             if found.coherence >= GOOD_COHERENCE and not weighed:
@@ -290,7 +290,7 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     except TooWeak as error:
         if before is None or before.coherence < GOOD_COHERENCE:
             raise
-        carrier.output.note(f"  {error.message}: once more, with {before.peak_Nm:.2f} Nm")
+        carrier.output.note(f"  {error.message}: once more, with {text_Nm(before.peak_Nm, 2)}")
     return _whole(task, carrier, before.peak_Nm, None)
 
 
@@ -299,7 +299,7 @@ def _whole(
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
     """Of all legs."""
     found, records, plan = _stage(task, carrier, peak_Nm, task.pairs)
-    carrier.output.note(f"  {found.peak_Nm:.2f} Nm: coherence {found.coherence:.3f}, {found.legs} legs")
+    carrier.output.note(f"  {text_Nm(found.peak_Nm, 2)}: coherence {found.coherence:.3f}, {found.legs} legs")
     if before is not None:
         _refuse_growth(before, found)
     return found, records, plan
@@ -447,7 +447,7 @@ def _stage(
     motion = task.motion(peak_Nm, pairs)
 
     def measured() -> tuple[FrequencyResponse, Any, ResponsePlan]:
-        title = f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm"
+        title = f"{task.config.path.stem}: response, {text_Nm(peak_Nm, 2)}"
         carried = carrier.run(task.config, motion, title, also_faults=True)
         if carried.text is not None:
             ended = _ended(title, carried)

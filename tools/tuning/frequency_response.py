@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import DataError, UsageError
+from jointctl.drivers.errors import DataError, UsageError, text_Nm
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
@@ -302,8 +302,8 @@ class ResponseMotion:
             f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
             f"{top:.2f} rad/s, {duration_s:.0f} s",
             f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
-            f"at first {plan.peak_Nm:.2f} Nm on top of what the motion takes; the same again with more while the "
-            f"coherence is low, up to {self.most_Nm:.2f} Nm, about 2 minutes in all",
+            f"at first {text_Nm(plan.peak_Nm, 2)} on top of what the motion takes; the same again with more while the "
+            f"coherence is low, up to {text_Nm(self.most_Nm, 2)}, about 2 minutes in all",
             f"law        kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s; "
             "a stiffer one follows where the weak one is too weak for the friction",
             limits_line(config.limits),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import UsageError
+from jointctl.drivers.errors import UsageError, text_Nm
 from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -221,7 +221,7 @@ def _add_gains(table: Table, config: Config, settings: LoopSettings) -> dict[str
             key: value for key, value in learning.model_dump().items() if value != before.get(key)
         }
     note = f"phase margin {found.phase_margin_deg:.1f} deg, " if found.stable else "UNSTABLE, "
-    note += f"|S| {found.sensitivity_peak:.2f} at most, torque noise {gains.noise_Nm:.2f} Nm"
+    note += f"|S| {found.sensitivity_peak:.2f} at most, torque noise {text_Nm(gains.noise_Nm, 2)}"
     if not met:
         one_encoder = config.reducer is not None and settings.encoders != Encoders.BOTH
         note += ": NOT what is asked for, there are no such gains; less delay"

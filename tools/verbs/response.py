@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import INTERRUPTED, DataError
+from jointctl.drivers.errors import INTERRUPTED, DataError, text_Nm
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
     """What was found beside what the configuration says."""
     table = Table(
         "quantity", *(Column(name, justify="right") for name in ("found", "+-", "configured")), "",
-        title=f"{'Two masses' if fit.flexible else 'Rigid joint'}, {found.legs} legs, {found.peak_Nm:.2f} Nm, "
+        title=f"{'Two masses' if fit.flexible else 'Rigid joint'}, {found.legs} legs, {text_Nm(found.peak_Nm, 2)}, "
         f"coherence {found.coherence:.3f}",
         caption="+-: intervals of 95 %; docs/tune.md says what is in them", title_justify="left",
         caption_justify="left",

@@ -20,6 +20,8 @@ from jointctl.tools.sweeping.options import AS_IT_FITS, SweepOptions, check_file
 from jointctl.tools.verbs.verb_options import JointOnBus, VerbOutput
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointctl.drivers.drive import CommissioningReport
     from jointctl.firmware_py.states import Fault
     from jointctl.tools.configuration.config import Config
@@ -48,6 +50,12 @@ def joint_model(config: Config, settings: PlanSettings) -> JointModel:
          settings.ripple_per_motor_turn * config.joint.reduction_ratio / math.tau,
          2.0 * settings.ripple_per_motor_turn * config.joint.reduction_ratio / math.tau),
     )  # fmt: skip
+
+
+def _speeds(points: Sequence[SweepPoint]) -> str:
+    """The first eight, and how many there are besides."""
+    shown = ", ".join(f"{point.velocity_radps:+.4g}" for point in points[:8])
+    return f"{shown} rad/s" + (f" and {len(points) - 8} more" if len(points) > 8 else "")
 
 
 @dataclass(frozen=True)
@@ -208,8 +216,8 @@ class Sweep:
         if result is None:
             return None
         if meter.lost_points:
-            shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in meter.lost_points[:8])
-            self.output.warning(f"too few samples came for {len(meter.lost_points)} points: {shown} rad/s; --resume")
+            shown = _speeds(meter.lost_points)
+            self.output.warning(f"too few samples came for {len(meter.lost_points)} points: {shown}; --resume")
         if result.lost_records:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
         self._raise_fault(result.fault, result.fault_text)
@@ -281,8 +289,8 @@ class Sweep:
         self.output.result(self._table(), vars(found), found)
         self._write_page()
         if self._unsettled:
-            shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in list(self._unsettled.values())[:8])
-            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown} rad/s")
+            shown = _speeds(list(self._unsettled.values()))
+            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown}")
         if stopped:
             kept = f"what was measured is in {self.out}, --resume goes on" if done else "nothing was measured"
             self.output.note(f"stopped by {stopped}; {kept}")

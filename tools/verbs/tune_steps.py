@@ -25,6 +25,7 @@ from jointctl.drivers.errors import (
     MotionFault,
     TooFewPoints,
     one_line,
+    text_Nm,
 )
 from jointctl.firmware_py.input_file import read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
@@ -148,20 +149,18 @@ class Tune:
         inside, slowly = f"{low:+.3f} .. {high:+.3f} rad", speeds_in_turn(self.config)
         verified = f"{self.verifying.kind} of the configuration"
         if self.verifying.kind != self.config.trajectory.kind:
-            verified = (
-                f"{self.verifying.kind} over the range of the configured motion, whose approach may swing too far"
-            )
+            verified = f"{self.verifying.kind} over the range of the configured motion, whose approach may swing far"
         return [
             f"tune       {output}, law {self.options.law}, objective {self.options.objective}",
             "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
-            f"response   triangle at 0.2 rad/s within {inside}, multisine up to {task.largest_Nm:.1f} Nm, 2 minutes",
+            f"response   triangle at 0.2 rad/s within {inside}, multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
             f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
             f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft; at up to "
             f"{slowly[-1]:g} where it swings",
             f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
             "and after it half a minute of the response, for a joint that has changed",
-            f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
-            "keep the joint free and unloaded, a hand on the emergency stop",
+            f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)} in every "
+            "step; keep the joint free and unloaded, a hand on the emergency stop",
         ]
 
     # --- the chain ---
@@ -213,6 +212,8 @@ class Tune:
                 )
             steps = STEPS if kept.get("asked") == asked else STEPS[: STEPS.index("gains")]  # another law or objective
             self.state = {name: kept[name] for name in steps if name in kept}
+        elif not self.carrier.consent.dry_run:
+            path.unlink(missing_ok=True)  # a later --resume must not go on with an older tune's steps
         self._about: dict[str, Any] = {"about": about, "asked": asked}
 
     def _save(self) -> None:
@@ -250,8 +251,8 @@ class Tune:
         allowed_Nm = self.config.limits.torque_max_Nm
         if needed_Nm > FRICTION_SHARE * allowed_Nm:
             raise MotionFault(
-                f"the joint began to move at {needed_Nm:.1f} Nm, and the torque (={allowed_Nm:g} Nm) must be more than "
-                f"{needed_Nm / FRICTION_SHARE:.1f} Nm for the rest",
+                f"the joint began to move at {text_Nm(needed_Nm)}, and the torque (={allowed_Nm:g} Nm) must be more "
+                f"than {text_Nm(needed_Nm / FRICTION_SHARE)} for the rest",
                 "--torque, limits.torque_max_Nm; or the brake is closed",
             )
         return [asdict(finding) for finding in findings]

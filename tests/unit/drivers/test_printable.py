@@ -16,6 +16,7 @@ from jointctl.drivers.errors import (
     one_line,
     printable,
     shortened,
+    text_Nm,
 )
 from jointctl.tools.configuration.config import ConfigurationProblems
 
@@ -103,3 +104,13 @@ def test_a_message_ends_somewhere() -> None:
     assert len(message_line("a word and " * 1000)) == LONGEST_MESSAGE
     apostrophes = "the drive's answer is not the controller's, " * 8
     assert message_line(apostrophes) == apostrophes  # no quotes
+
+
+@pytest.mark.parametrize(
+    ("torque_Nm", "text"),
+    [(60.0, "60.0 Nm"), (1.0, "1.0 Nm"), (0.2, "0.20 Nm"), (-0.034, "-0.034 Nm"), (0.0, "0.0 Nm"), (1e-9, "0.0 Nm")],
+)
+def test_torques_of_small_joints_keep_digits_that_count(torque_Nm: float, text: str) -> None:
+    """A joint of 0.25 Nm was said to be limited to 0.2 Nm."""
+    assert text_Nm(torque_Nm) == text
+    assert text_Nm(torque_Nm, 1, 500.0) == f"{torque_Nm:.1f} Nm"

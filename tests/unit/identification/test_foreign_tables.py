@@ -161,6 +161,12 @@ def test_timestamps_are_seconds(tmp_path, columns, ours, style):
         f"{stamp.replace('T', ' ' if zone else 'T')}{zone},{line}" for stamp, line in zip(stamps, body, strict=True)
     ]
     alike(read_motion(written(tmp_path / "a.csv", "\n".join(["t,q,tau", *rows])), FORMAT, SETTINGS), ours)
+    with pytest.raises(UsageError, match=r"--time-unit \(=ms\) is for numbers: t has dates or times of day"):
+        read_motion(tmp_path / "a.csv", replace(FORMAT, time_unit="ms"), SETTINGS)
+    twice = written(tmp_path / "c.csv", "\n".join(["t,q,tau", *rows, *rows]))
+    assert any(
+        "2 motions by t" in note for note in read_motion(twice, replace(FORMAT, motion_column="t"), SETTINGS).notes
+    )
     rows[300] = "yesterday," + body[300]
     with pytest.raises(DataError, match=r"line 302: t \(=yesterday\) must be a time as"):
         read_motion(written(tmp_path / "b.csv", "\n".join(["t,q,tau", *rows])), FORMAT, SETTINGS)

@@ -142,6 +142,7 @@ class TestInfo:
         assert found["errors"]["error_code"] == "0000h, no error"
         limits = {row["object"]: row for row in found["limits"]}
         assert limits["6072"]["unit"] == "permille of rated torque"
+        assert limits["6085"]["unit"] == "units of 6064 per s2, unless scaled"
         assert found["supervision"]["on_quick_stop"].startswith("2 quick stop ramp")
         (tpdo,) = [row for row in found["pdos"] if row["pdo"] == "TPDO2"]
         assert (tpdo["cob_id"], tpdo["enabled"], tpdo["transmission"]) == ("281h", False, "every SYNC")

@@ -226,6 +226,13 @@ def test_a_table_is_checked_before_it_begins(
     assert joint.state.desired_position_rad == before
 
 
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, 1e6])
+def test_a_duration_is_refused_by_the_name_that_the_program_gave_it(joint: Joint, duration_s: float) -> None:
+    with pytest.raises(jointctl.ConfigurationError, match=r"^duration_s \(=.*\) must be in \[0.001..100000\] s"):
+        joint.move_to(0.2, duration_s=duration_s)
+    joint.move_to(0.11, duration_s=1.0)
+
+
 def test_nothing_enables_twice_and_nothing_moves_after_a_stop(joint: Joint) -> None:
     with pytest.raises(jointctl.UsageError, match="enabled before"):
         joint.enable()

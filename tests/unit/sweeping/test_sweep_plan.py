@@ -47,7 +47,7 @@ from jointctl.tools.sweeping.plan import (
     shifted,
     stroke_of,
 )
-from jointctl.tools.verbs.sweep import sweep
+from jointctl.tools.verbs.sweep import _speeds, sweep
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, edited
 from tests.sessions import output
@@ -477,3 +477,8 @@ def test_a_bad_key_of_the_sweeps_configuration_is_one_line(tmp_path: Path, old: 
     with pytest.raises(ConfigurationError) as error:
         edited(tmp_path, (old, new), base="sweep_virtual")
     assert text in error.value.message
+
+
+@pytest.mark.parametrize(("count", "end"), [(8, "+0.8 rad/s"), (9, "+0.8 rad/s and 1 more")])
+def test_speeds_that_are_not_listed_are_counted(count: int, end: str) -> None:
+    assert _speeds([SweepPoint(i, 0.1 * (i + 1), 0) for i in range(count)]).endswith(end)
