@@ -57,12 +57,15 @@ def shortened(value: str) -> str:
     return f"{value[: LONGEST_VALUE - _TAIL - 3]}...{value[-_TAIL:]}"
 
 
-def text_Nm(torque_Nm: float, decimals: int = 1, greatest_Nm: float | None = None) -> str:
-    """A torque with its unit: so many decimals, more where it, or the greatest of a row, is below 1 Nm."""
-    size = abs(torque_Nm if greatest_Nm is None else greatest_Nm)
-    if 1e-4 < size < 1.0:
-        decimals = max(decimals, 1 - math.floor(math.log10(size)))
-    return f"{torque_Nm:.{decimals}f} Nm"
+def decimals_of(torque_Nm: float, least: int) -> int:
+    """Of a torque, or of a row with this greatest one: so many at least, and two digits that count below 1 Nm."""
+    size = abs(torque_Nm)
+    return max(least, 1 - math.floor(math.log10(size))) if 1e-4 < size < 1.0 else least
+
+
+def text_Nm(torque_Nm: float, decimals: int = 1) -> str:
+    """A torque with its unit."""
+    return f"{torque_Nm:.{decimals_of(torque_Nm, decimals)}f} Nm"
 
 
 def message_line(text: str) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jointctl.drivers.errors import decimals_of
 from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 from jointctl.tools.drawing import (
@@ -530,7 +531,9 @@ def motion_of(summary: RunSummary) -> Figures:
         ("within 1 mrad for good after [s]", summary.settling_s, 2),
     ]
     for name, key in TORQUES.items():
-        rows += _ends(name, getattr(summary, key), "Nm", 1.0, 2)
+        torque: Range | None = getattr(summary, key)
+        digits = 2 if torque is None else decimals_of(torque.peak, 2)
+        rows += _ends(name, torque if torque is not None and torque.peak != 0.0 else None, "Nm", 1.0, digits)
     rows += _ends("temperature of the drive", summary.temperature_degC, "°C", 1.0, 1)
     return rows
 
@@ -562,7 +565,7 @@ def figure_tables(
 def _side_by_side(title: str, names: Sequence[str], listed: Sequence[Figures], caption: str, two: bool) -> Table:
     rows: list[list[object]] = []
     for row in zip(*listed, strict=True):
-        name, digits = row[0][0], row[0][2]
+        name, digits = row[0][0], max(digits for _, _, digits in row)
         values = [value for _, value, _ in row]
         if all(value is None for value in values):
             continue

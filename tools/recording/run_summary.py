@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import DataError, text_Nm
+from jointctl.drivers.errors import DataError, decimals_of
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
@@ -210,10 +210,9 @@ def summary_table(summary: RunSummary) -> Table:
     table.add_row("within 1 mrad for good", _settled_text(summary))
     for name, key in TORQUES.items():
         torque: Range | None = getattr(summary, key)
-        if torque is not None and (torque.least, torque.greatest) != (0.0, 0.0):  # zero: the law has no such part
-            greatest_Nm = max(-torque.least, torque.greatest)
-            least, most = (text_Nm(end, 2, greatest_Nm) for end in (torque.least, torque.greatest))
-            table.add_row(name, f"{least.removesuffix(' Nm')} .. {most}")
+        if torque is not None and torque.peak != 0.0:  # zero: the law has no such part
+            digits = decimals_of(torque.peak, 2)
+            table.add_row(name, f"{torque.least:.{digits}f} .. {torque.greatest:.{digits}f} Nm")
     for name, key in (*TIMES.items(), ("SYNC of all buses", "sync_spread")):
         times: TimeSummary | None = getattr(summary, key)
         if times is not None:

@@ -113,4 +113,3 @@ def test_a_message_ends_somewhere() -> None:
 def test_torques_of_small_joints_keep_digits_that_count(torque_Nm: float, text: str) -> None:
     """A joint of 0.25 Nm was said to be limited to 0.2 Nm."""
     assert text_Nm(torque_Nm) == text
-    assert text_Nm(torque_Nm, 1, 500.0) == f"{torque_Nm:.1f} Nm"
