@@ -62,12 +62,15 @@ def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, 
     weak = {"control__kp": 400.0, "control__kv": 12.0, "control__observer_radps": 3.0}
     joint = changed(config, virtual__friction_kind="stick_slip", **weak)
     options = {"points": 4, "min_speed_radps": 0.008, "max_speed_radps": 0.016, "mode": "torque"}
-    found = swept(joint, tmp_path / "data.csv", **options)
+    shown, _, err = output()
+    assert sweep(joint, shown, tmp_path / "data.csv", SweepOptions(lockstep=True, **options)) == 0
+    found = rows(tmp_path / "data.csv")
     unsettled = found[found["settled"] == 0]
     assert len(unsettled) > 0
     assert len(found) > 4
     sidecar = json.loads((tmp_path / "data.json").read_text())
     assert all(sidecar["unsettled"].values())
+    assert f"; the last one: {[*sidecar['unsettled'].values()][-1]}; a longer --dwell" in err.getvalue()
 
 
 def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:

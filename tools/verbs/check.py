@@ -79,6 +79,7 @@ def check(
     learning, warnings = learning_of(config, settings), contradictions(config)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
+        value += "" if learning.worst_factor < 1.0 else ": diverges"
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
     chosen = _add_gains(table, config, settings) if choose_gains else None
     if figure is not None:

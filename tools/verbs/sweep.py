@@ -93,6 +93,7 @@ class Sweep:
         self._attached_Nm = math.nan  # the load that the user has confirmed
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
+        self._problem = ""  # of the newest point that did not settle
         self._consent = TerminalConsent(
             output, assume_yes=options.assume_yes or options.lockstep, dry_run=options.dry_run
         )
@@ -248,7 +249,7 @@ class Sweep:
         self.file.add(replace(measured, time_s=measured.time_s + self._time_offset_s))
         result = measured.result
         if result.problem:
-            self._unsettled[measured.point.index] = measured.point
+            self._unsettled[measured.point.index], self._problem = measured.point, result.problem
         else:
             self._unsettled.pop(measured.point.index, None)
         if self.output.stderr.isatty():
@@ -290,7 +291,8 @@ class Sweep:
         self._write_page()
         if self._unsettled:
             shown = _speeds(list(self._unsettled.values()))
-            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown}")
+            why = f"; the last one: {self._problem}; a longer --dwell may help" if self._problem else ""
+            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown}{why}")
         if stopped:
             kept = f"what was measured is in {self.out}, --resume goes on" if done else "nothing was measured"
             self.output.note(f"stopped by {stopped}; {kept}")

@@ -397,6 +397,8 @@ def test_learning_is_judged_with_the_worst_joint() -> None:
         found = learning_of(config, loop_settings(config)[0])
         assert found is not None
         assert (found.worst_factor < 1.0) is converges
+        out, _, _ = run_check(config)
+        assert (": diverges" in out) is not converges
 
 
 def test_gains_are_chosen_on_request_for_the_law_of_the_file() -> None:
