@@ -58,9 +58,9 @@ def shortened(value: str) -> str:
 
 
 def decimals_of(torque_Nm: float, least: int) -> int:
-    """Of a torque, or of a row with this greatest one: so many at least, and two digits that count below 1 Nm."""
+    """Of a torque, or of a row with this greatest one: so many at least, two digits that count below 1 Nm."""
     size = abs(torque_Nm)
-    return max(least, 1 - math.floor(math.log10(size))) if 1e-4 < size < 1.0 else least
+    return max(least, 1 - math.floor(math.log10(size))) if 1e-6 < size < 1.0 else least
 
 
 def text_Nm(torque_Nm: float, decimals: int = 1) -> str:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, MarginError, MotionFault, UsageError
-from jointctl.tools.analysis.reducer_map import found_map
+from jointctl.tools.analysis.reducer_map import FoundMap, Wave, found_map
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, map_verb
+from jointctl.tools.verbs.map import MapOptions, _table, config_of_map, map_run, map_verb
 from tests.configurations import shipped, written
 
 IN_LOCKSTEP = MapOptions(travel_rad=0.5, lockstep=True)
@@ -150,3 +150,9 @@ def test_the_faults_of_the_virtual_joint_end_a_map_in_simulated_time(tmp_path: P
     )
     with pytest.raises(MotionFault, match="no map"):
         map_verb(faulty, Output(stdout=io.StringIO(), stderr=io.StringIO()), options=IN_LOCKSTEP)
+
+
+def test_small_ripple_is_shown_with_the_digits_of_its_interval() -> None:
+    """0.002 Nm with an interval of 0.000 said nothing."""
+    table = _table(FoundMap((), (Wave(2, 0.001998, 7.4e-5, 0.0, 0.04, True),), (10, 10), 0.03))
+    assert [next(iter(column.cells)) for column in table.columns[2:4]] == ["0.001998", "0.000074"]

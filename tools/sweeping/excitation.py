@@ -300,6 +300,7 @@ def excitation_figure(design: Design, title: str) -> Figure:
             axes["c"].plot(found.velocity_radps[chosen], design.torque_Nm[chosen], ".", color=colour, markersize=2.0,
                            label=label)  # fmt: skip
         axes["c"].set_xlabel("speed [rad/s]")
+        axes["c"].locator_params(axis="x", nbins=5)  # it is narrow
         axes["c"].set_ylabel("expected torque at the joint [Nm]")
         axes["c"].legend()
         return figure

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, decimals_of
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
@@ -223,10 +223,11 @@ def _table(found: FoundMap) -> Table:
         title_justify="left",
         caption_justify="left",
     )
-    for name, waves, scale, digits in (
+    for name, waves, scale, least in (
         ("kinematic error [mrad]", found.kinematic_rad, 1e3, 4), ("torque ripple [Nm]", found.ripple_Nm, 1.0, 3),
     ):  # fmt: skip
         for wave in kept_waves(waves):
+            digits = decimals_of(scale * wave.amplitude_half, least)
             table.add_row(
                 name, str(wave.per_motor_turn), f"{scale * wave.amplitude:.{digits}f}",
                 f"{scale * wave.amplitude_half:.{digits}f}", f"{wave.phase_rad:+.3f}", f"{wave.phase_half_rad:.3f}",

@@ -108,7 +108,15 @@ def test_a_message_ends_somewhere() -> None:
 
 @pytest.mark.parametrize(
     ("torque_Nm", "text"),
-    [(60.0, "60.0 Nm"), (1.0, "1.0 Nm"), (0.2, "0.20 Nm"), (-0.034, "-0.034 Nm"), (0.0, "0.0 Nm"), (1e-9, "0.0 Nm")],
+    [
+        (60.0, "60.0 Nm"),
+        (1.0, "1.0 Nm"),
+        (0.2, "0.20 Nm"),
+        (-0.034, "-0.034 Nm"),
+        (2e-4, "0.00020 Nm"),
+        (0.0, "0.0 Nm"),
+        (1e-9, "0.0 Nm"),
+    ],
 )
 def test_torques_of_small_joints_keep_digits_that_count(torque_Nm: float, text: str) -> None:
     """A joint of 0.25 Nm was said to be limited to 0.2 Nm."""
