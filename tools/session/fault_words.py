@@ -146,7 +146,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "report the run log: this should not happen with a checked configuration",
     ),
     Fault.TORQUE_SATURATED: FaultWords(
-        "the torque stayed at its limit ({torque} Nm) for too long",
+        "the torque stayed at its limit ({torque}) for too long",
         "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
         "turn the joint by hand with the power off, then look at the friction values",
     ),
@@ -299,7 +299,7 @@ def fault_text(
     text = row.two_encoders if two_encoders and row.two_encoders else row
     if encoder_error and row.two_encoders:
         text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
-    happened = text.happened.format(value=value, torque=text_Nm(value).removesuffix(" Nm"), word=_word_text(value))
+    happened = text.happened.format(value=value, torque=text_Nm(value), word=_word_text(value))
     if drive_error:
         happened += f"; the drive's error code is {emergency_text(drive_error)}"
     if encoder_error:
