@@ -119,6 +119,7 @@ class Law:
     ripple_radps: float = RIPPLE_radps
     sensitivity: float = SENSITIVITY
     encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
+    of_soft: tuple[tuple[float, float, int], ...] | None = None  # `spans` of a soft joint, where they are others
 
     def beyond(self, settings: LoopSettings) -> float:
         """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
@@ -163,7 +164,8 @@ class Law:
 LAWS = {
     "precise": Law(
         "precise", lambda: shipped_control("precise"), ("kv", "observer_radps", "cutoff_Hz"),
-        ((4.0, 300.0, 8), (6.0, 45.0, 5), (5.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
+        of_soft=((4.0, 300.0, 8), (6.0, 45.0, 5), (5.0, 450.0, 6)),
     ),
     "paper": Law(
         "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
@@ -461,6 +463,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s, *wanted)
     search = _Search(config, law, intervals, settings)
+    spans = law.spans if config.reducer is None or law.of_soft is None else law.of_soft
 
     def cost(one: Judged, least_error: float | None) -> float:
         if not one.stable:
@@ -476,7 +479,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
 
     def best_of(least_error: float | None) -> Judged:
         if not search.tried:
-            for point in product(*(np.geomspace(*span) for span in law.spans)):
+            for point in product(*(np.geomspace(*span) for span in spans)):
                 search.judged(np.log(point))
 
         def of(one: Judged) -> float:
