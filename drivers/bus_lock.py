@@ -423,9 +423,11 @@ def lock_name(interface: str, channel: str) -> str:
         path = socket_path(channel)
         place = f"{interface}:{path}"
         with contextlib.suppress(OSError):
-            found = os.stat(path)
-            # with its time: the number of a socket file that is gone is given to the next one
+            found = os.stat(path)  # with its time: the number of a socket file that is gone is given to the next one
             place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}:{found.st_ctime_ns:x}"
+    elif interface == "socketcan":
+        with contextlib.suppress(OSError):
+            place = f"{interface}:{socket.if_indextoname(socket.if_nametoindex(channel))}"  # of an altname
     elif interface == "serial" or port_path(channel).startswith("/"):
         place = f"{interface}:{os.path.realpath(port_path(channel))}"
     return LOCKS + hashlib.sha256(place.encode()).hexdigest()[:32]

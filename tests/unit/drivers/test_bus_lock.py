@@ -103,6 +103,16 @@ def test_links_lead_to_the_same_bus(tmp_path: Path) -> None:
     assert lock_name("seeedstudio", link) == lock_name("seeedstudio", device) != lock_name("slcan", device)
 
 
+def test_an_altname_of_an_interface_is_the_same_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`jointctl stop -c` with the other name would not have found the program that controls it."""
+    name = lock_name("socketcan", "can0")
+    monkeypatch.setattr(socket, "if_nametoindex", {"can0": 4, "left-arm": 4, "can1": 5}.__getitem__)
+    monkeypatch.setattr(socket, "if_indextoname", {4: "can0", 5: "can1"}.__getitem__)
+    assert (
+        lock_name("socketcan", "left-arm") == lock_name("socketcan", "can0") == name != lock_name("socketcan", "can1")
+    )
+
+
 def test_a_bus_of_the_same_name_behind_another_mount_is_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
