@@ -239,6 +239,7 @@ _SWAPPED_CURE = "swap encoder.counts_per_turn and joint_encoder.counts_per_turn 
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
+LOOSE = 0.2  # of the way that it came: less may be the bristles of friction that holds it
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
@@ -310,8 +311,8 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
     torque = np.where(powered, rows.command_torque_Nm, 0.0)
     pushed = np.where(powered, rows.command_torque_Nm - rows.gravity_torque_Nm, 0.0)
     work = float(np.sum(pushed[:-1] * np.diff(way)))
-    moved = np.nonzero(np.abs(way) >= threshold_rad)[0]
-    first = int(moved[0]) if len(moved) else -1
+    loose = np.nonzero(np.abs(way) >= max(threshold_rad, LOOSE * np.abs(way).max()))[0]
+    first = int(loose[0]) if len(loose) else -1
     smooth, measured = _smoothed(torque), _smoothed(np.asarray(rows.measured_torque_Nm))
     strong = np.abs(smooth) > 0.5 * np.abs(smooth).max()
     ratio = None

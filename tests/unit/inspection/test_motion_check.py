@@ -123,6 +123,14 @@ def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: f
     assert made.frozen_torque_Nm < plan.torque_Nm
 
 
+@pytest.mark.parametrize("bristle_Nmprad", [5e3, 8e4])
+def test_bristles_that_give_way_are_not_taken_for_breaking_away(tmp_path: Path, bristle_Nmprad: float) -> None:
+    """4 mrad under the static friction, where 1.2 mrad of the motor's encoder count as moved."""
+    findings, _, fault = checked(config_with(tmp_path, virtual__bristle_stiffness_Nmprad=bristle_Nmprad))
+    assert fault is Fault.NONE
+    assert findings["friction"].numbers["break_away_Nm"] > 0.95 * 19.0575
+
+
 @pytest.mark.parametrize("gravity_Nm", [-12.0, 0.0, 12.0])
 def test_the_torque_to_break_away_is_that_beside_gravity(tmp_path: Path, gravity_Nm: float) -> None:
     """A pull down takes less torque than friction, a pull up takes more."""
