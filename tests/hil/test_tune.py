@@ -165,11 +165,13 @@ def test_on_a_slow_bus_the_response_finds_gains_of_its_own(tmp_path: Path, gains
     """At 250 Hz the gate refuses the weak law, and the file's, or the file's on the joint that is found."""
     control = dict(zip(("control__kp", "control__kv", "control__observer_radps"), gains, strict=True))
     path = written(tmp_path / "soft.toml", "realistic", loop__rate_Hz=250, control__velocity_cutoff_Hz=100, **control)
-    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
     before = with_break_away(load_config(path), 19.0)
     law, task, (found, *_) = response_by_any_law(before, 12, carrier)
     assert law == ALONE
     assert task.config.control.kind == "flexible_joint"
+    assert ("the gate refuses the gains of the file; for the response: kp" in err.getvalue()) == (gains[0] == 300.0)
     assert fit_of(found, task.config, 19.0).inertia_kgm2.value == pytest.approx(2.1, rel=0.03)
 
 

@@ -7,6 +7,7 @@ simulated time as well.
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -227,6 +228,7 @@ class ResponseTask:
     sine: Multisine
     pairs: int
     largest_Nm: float
+    chosen: bool = False  # the gains are none of the file
 
     def motion(self, peak_Nm: float, pairs: int) -> ResponseMotion:
         plan = ResponsePlan(legs_of(self.config, pairs), self.sine, peak_Nm)
@@ -242,15 +244,18 @@ def response_task(config: Config, torque_Nm: float | None, legs: int, law: Respo
     """
     if not LEAST_LEGS <= legs <= MOST_LEGS:
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
-    moving = config_of_response(config, torque_Nm, law)
+    moving, chosen = config_of_response(config, torque_Nm, law), False
     if law is WEAK and not _passes(moving):
         moving = config_of_response(config, torque_Nm, None)
         if not _passes(moving):
-            moving = config_of_response(_with_chosen_gains(config), torque_Nm, None)
+            suited = _with_chosen_gains(config)
+            moving, chosen = config_of_response(suited, torque_Nm, None), suited is not config
     _, length_s = speed_and_period(moving)
-    return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), legs // 2, largest_peak_Nm(moving))
+    sine = multisine(moving.loop.rate_Hz, length_s)
+    return ResponseTask(moving, sine, legs // 2, largest_peak_Nm(moving), chosen)
 
 
+@functools.lru_cache(maxsize=4)  # of one command, which asks before and after its question
 def _with_chosen_gains(config: Config) -> Config:
     """Of the law of the configuration; as it was where none of them are what is wanted, or it has no such law."""
     from jointctl.tools.analysis.gains import gains_of_file  # here: hardly any response needs a search
@@ -346,6 +351,10 @@ def response_by_any_law(
         task = replace(task, largest_Nm=min(task.largest_Nm, largest_peak_Nm(before)))  # which was announced
         if law != ALONE:
             carrier.output.note(f"  law: {law}")
+        if task.chosen:
+            control = task.config.control
+            gains = f"kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s"
+            carrier.output.note(f"  the gate refuses the gains of the file; for the response: {gains}")
         try:
             return law, task, measured_response(task, carrier)
         except TooWeak as error:
