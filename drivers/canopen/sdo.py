@@ -365,7 +365,8 @@ class SdoReads:
         self._answers: deque[tuple[int, bytes]] = deque(maxlen=_ANSWERS)
         self._open: SdoRead | None = None  # whose answer is waited for
         self._asked_ns = 0
-        self._quiet_ns = self._free_ns = clock_ns()  # not before; when no one kept it from asking
+        self._quiet_ns = clock_ns()  # not before
+        self._kept_ns: int | None = None  # since when another program keeps it from asking for what is due
         network.subscribe(self._tx, self._on_frame)
 
     def add(self, index: int, sub: int, period_s: float, on_answer: Callable[..., None]) -> None:
@@ -388,11 +389,13 @@ class SdoReads:
         may_ask = may_ask and self._open is None
         due = [read for read in self._reads if may_ask and read.next_ns <= now_ns]
         if not due or now_ns >= self._quiet_ns:
-            self._free_ns = now_ns
+            self._kept_ns = None
             if due:
                 self._ask(min(due, key=lambda read: read.next_ns), now_ns)
-        elif now_ns - self._free_ns >= ANSWER_S * 1e9:
-            self._free_ns = now_ns
+        elif self._kept_ns is None:
+            self._kept_ns = now_ns
+        elif now_ns - self._kept_ns >= ANSWER_S * 1e9:
+            self._kept_ns = now_ns
             for read in due:
                 read.next_ns = now_ns + round(read.period_s * 1e9)
                 read.on_answer(now_ns, None, "SDO transfers of another program leave no time for it")

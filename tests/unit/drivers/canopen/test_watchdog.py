@@ -430,7 +430,7 @@ def test_reads_of_another_program_that_leave_no_room_keep_the_loop_from_enabling
         return
     with pytest.raises(DeviceError, match=r"cannot be read any more: SDO transfers of another program leave no time"):
         poll_beside_them()
-    assert run.now_s < 105.0
+    assert run.now_s < 105.2
 
 
 def test_it_costs_four_uploads_a_second(run: Run) -> None:
