@@ -163,8 +163,14 @@ class LoopHandle:
         return int(self.block.words[Word.HEAD]) // self.block.axes
 
     def allow_enable(self) -> None:
-        """Let the axis leave WAITING (see `SequenceConstants.may_enable`)."""
-        self.block.constants[0].sequence.may_enable = 1
+        """Let all axes leave WAITING (see `SequenceConstants.may_enable`) once each of them may.
+
+        From then on they count the time in which not all stand; what the supervisor takes for another one is none.
+        """
+        block = self.block
+        block.allowed.add(block.axis)
+        if len(block.allowed) == block.axes:
+            block.whole.constants.sequence.may_enable[:] = 1
 
     def beat(self) -> None:
         """The supervisor's sign of life."""

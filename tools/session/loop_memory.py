@@ -43,6 +43,7 @@ class SharedBlock:
         self.fd = fd
         self.table_rows, self.axes, self.axis = table_rows, axes, 0
         self.whole = self  # also seen from one axis
+        self.allowed = set[int]()  # axes that may enable, so says their supervisor, who alone knows it
         self._offset = 0
         size = self._size(table_rows, port, axes)
         os.ftruncate(fd, max(os.fstat(fd).st_size, size))

@@ -7,12 +7,14 @@ from typing import Any
 
 import pytest
 
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.errors import MotionFault
 from jointctl.firmware_py.cycle import WORDS, Word
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.session import loop_handle
 from jointctl.tools.session.elmo_drive import SPARE_S
 from jointctl.tools.session.loop_handle import LOOK_S, OPENING_S, SILENT_S, LoopHandle
+from jointctl.tools.session.loop_memory import SharedBlock
 
 NOW_ns = 10_000_000_000_000
 MICROSECOND_ns = 1000
@@ -126,3 +128,15 @@ def test_one_standstill_is_forgiven_and_not_a_slow_supervisor(clock: Clock, look
     clock.now_ns += round(look_s * SECOND_ns)
     with pytest.raises(MotionFault, match=f"did nothing for {after_s:.1f} s"):
         handle.running()
+
+
+def test_no_joint_of_an_arm_may_enable_before_all_of_them_may() -> None:
+    """An early one would count the time that the supervisor takes for the others as one in which not all stand."""
+    handle: Any = LoopHandle.__new__(LoopHandle)
+    handle.block = SharedBlock.create(2, CanopenPort, axes=3)
+    for axis in (2, 0):
+        handle.of_axis(axis).allow_enable()
+        handle.of_axis(axis).allow_enable()
+        assert not handle.block.constants.sequence.may_enable.any()
+    handle.of_axis(1).allow_enable()
+    assert handle.block.constants.sequence.may_enable.all()
