@@ -20,7 +20,7 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
     """Stop and disable the drive now, or all those of an arm, also while another program controls them."""
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
-    from jointctl.drivers.bus_lock import StopCall, end_programs, marked_processes
+    from jointctl.drivers.bus_lock import StopCall, end_programs, lock_name, marked_processes
     from jointctl.drivers.drive import common_state, is_safe
     from jointctl.drivers.stop_note import LOCKS
     from jointctl.tools.verbs.bench_drive import stop_targets
@@ -45,10 +45,15 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
         from jointctl.tools.session.result import require_off  # takes its time to load: before the last look
 
         found = end_programs(calls, output.note, switch_off)
-    if not found and (others := marked_processes(LOCKS)):  # it may be the joint that was meant
-        buses = ", ".join(":".join(on) for on in dict.fromkeys(target.place for target in targets.values()))
-        pids = ", ".join(map(str, sorted(others)))
-        output.warning(f"found no program to end on {buses}; process {pids} controls another bus, and goes on")
+    if not found:  # another joint may be the one that was meant
+        places = dict.fromkeys(target.place for target in targets.values())
+        others = set(marked_processes(LOCKS)).difference(*(marked_processes(lock_name(*place)) for place in places))
+        if others:
+            buses, pids = ", ".join(":".join(place) for place in places), ", ".join(map(str, sorted(others)))
+            output.warning(
+                f"found no program to end on {buses}; those that control another bus go on, with the processes {pids}: "
+                "`jointctl stop` with the file of that joint"
+            )
     if failures:
         raise failures[0]
     state = common_state(list(targets), states)

@@ -371,8 +371,9 @@ class Computer:
     def stopped(self) -> bool:
         """Whether a controller has ended."""
         with StopCall("socketcan", "x") as call:
-            end_programs([call], self.notes.append, lambda: self.ended_s.append(self.now_s))
-        return bool(self.ended_s)
+            found = end_programs([call], self.notes.append, lambda: self.ended_s.append(self.now_s))
+        assert found is bool(self.ended_s)
+        return found
 
 
 def test_where_no_one_has_the_bus_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
