@@ -97,7 +97,7 @@ from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
 STATE = "steps.json"
-FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
+FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
 SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
@@ -155,8 +155,8 @@ class Tune:
             "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
             f"response   triangle at 0.2 rad/s within {inside}, multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
             f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
-            f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft; at up to "
-            f"{slowly[-1]:g} where it swings",
+            f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft"
+            + (f"; at up to {slowly[-1]:g} where it swings" if slowly[1:] else ""),
             f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
             "and after it half a minute of the response, for a joint that has changed",
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)} in every "
@@ -246,13 +246,14 @@ class Tune:
             raise MotionFault(why.text, why.remedy)
         for finding in findings:
             self.carrier.output.note(f"  {finding.topic}: {finding.text}")
-        needed_Nm = max((finding.numbers.get("break_away_Nm", 0.0) for finding in findings), default=0.0)
-        needed_Nm += abs(config.joint.gravity_Nm)
-        allowed_Nm = self.config.limits.torque_max_Nm
-        if needed_Nm > FRICTION_SHARE * allowed_Nm:
+        friction_Nm = max((finding.numbers.get("break_away_Nm", 0.0) for finding in findings), default=0.0)
+        gravity_Nm, allowed_Nm = abs(config.joint.gravity_Nm), self.config.limits.torque_max_Nm
+        needed_Nm = friction_Nm / FRICTION_SHARE + gravity_Nm
+        if needed_Nm > allowed_Nm:
+            beside = f" beside gravity (={gravity_Nm:g} Nm at most)" if gravity_Nm else ""
             raise MotionFault(
-                f"the joint began to move at {text_Nm(needed_Nm)}, and the torque (={allowed_Nm:g} Nm) must be more "
-                f"than {text_Nm(needed_Nm / FRICTION_SHARE)} for the rest",
+                f"the joint began to move at {text_Nm(friction_Nm)}{beside}, and the torque (={allowed_Nm:g} Nm) must "
+                f"be more than {text_Nm(needed_Nm)} for the rest",
                 "--torque, limits.torque_max_Nm; or the brake is closed",
             )
         return [asdict(finding) for finding in findings]
