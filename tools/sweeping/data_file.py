@@ -75,9 +75,9 @@ class SweepFile:
         return Counter(self._sidecar["measured"])
 
     @property
-    def unsettled(self) -> set[int]:
+    def unsettled(self) -> dict[int, str]:
         """Points whose last row did not settle."""
-        return {int(index) for index in self._sidecar["unsettled"]}
+        return {int(index): problem for index, problem in self._sidecar["unsettled"].items()}
 
     @property
     def elapsed_s(self) -> float:

@@ -93,7 +93,6 @@ class Sweep:
         self._attached_Nm = math.nan  # the load that the user has confirmed
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
-        self._problem = ""  # of the newest point that did not settle
         self._consent = TerminalConsent(
             output, assume_yes=options.assume_yes or options.lockstep, dry_run=options.dry_run
         )
@@ -249,7 +248,7 @@ class Sweep:
         self.file.add(replace(measured, time_s=measured.time_s + self._time_offset_s))
         result = measured.result
         if result.problem:
-            self._unsettled[measured.point.index], self._problem = measured.point, result.problem
+            self._unsettled[measured.point.index] = measured.point
         else:
             self._unsettled.pop(measured.point.index, None)
         if self.output.stderr.isatty():
@@ -291,7 +290,8 @@ class Sweep:
         self._write_page()
         if self._unsettled:
             shown = _speeds(list(self._unsettled.values()))
-            why = f"; the last one: {self._problem}; a longer --dwell may help" if self._problem else ""
+            problem = self.file.unsettled.get([*self._unsettled][-1])
+            why = f"; the last one: {problem}; a longer --dwell may help" if problem else ""
             self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown}{why}")
         if stopped:
             kept = f"what was measured is in {self.out}, --resume goes on" if done else "nothing was measured"
