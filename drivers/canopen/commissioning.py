@@ -32,7 +32,7 @@ from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
 from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline, quick_stop_of
 from jointctl.drivers.drive import DriveIdentity
-from jointctl.drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError, text_Nm
 from jointctl.firmware_py.states import in_words
 
 CIA402_PROFILE = 402
@@ -357,7 +357,7 @@ def lower_makers_limit(
             "or could not reach the drive at its end, restart the drive",
         )
     objects.lower(index, sub, counts, before, what=TORQUE_LIMIT)
-    return f"{name} = {counts} (was {before}) = {counts * count_Nm:.1f} Nm"
+    return f"{name} = {counts} (was {before}) = {text_Nm(counts * count_Nm)}"
 
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
@@ -398,7 +398,7 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     else:
         limits.append(lower_makers_limit(objects, settings, settings.torque_limit, scale))
     if settings.torque_limit is None or objects.write_if_present(0x6072, 0, findings.max_permille, what=MAX_TORQUE):
-        limits.insert(0, f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm")
+        limits.insert(0, f"{findings.max_permille} permille = {text_Nm(findings.max_permille * scale)}")
     else:
         findings.remarks.append(f"no object 6072: the drive limits its torque by {limits[0]}")
     if findings.mode is Mode.TORQUE:

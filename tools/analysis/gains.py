@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, text_Nm
 from jointctl.firmware_py.states import ControllerKind, Encoders
 from jointctl.tools.analysis.linear_loop import (
     Array,
@@ -251,7 +251,7 @@ class Goals:
             f"|S| {one.sensitivity:.2f}, {self.sensitivity:.3g} at most": one.sensitivity / self.sensitivity - 1.0,
             f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
                 math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
-            f"torque noise {one.noise_Nm:.2f} Nm, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
+            f"torque noise {text_Nm(one.noise_Nm, 2)}, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
             f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:g} deg":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
             f"|S| of the gate {one.gate_sensitivity:.2f}, {self.gate_sensitivity:.3g} at most":

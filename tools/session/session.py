@@ -137,6 +137,7 @@ class Session:
                 signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
+                    signals.look()  # which may have taken its time
                 around = {axis: Around(signals, *watchers, guard) for axis, watchers in looking_on.items()}
                 return self._supervise(drives, loop, reports, placed, around)
             except (BusError, DeviceError, NoDeviceError):
