@@ -47,8 +47,8 @@ LIGHT: dict[str, Any] = {  # 0.3 kg m^2 that break away at 10 Nm
     "joint__inertia_kgm2": 0.375, "virtual__inertia_scale": 0.8, "virtual__friction_positive_scale": 0.55,
     "virtual__friction_negative_scale": 0.5,
 }  # fmt: skip
-STICKY: dict[str, Any] = {  # 0.11 kg m^2 that break away at 14 Nm, believed to be 0.055 kg m^2
-    "joint__inertia_kgm2": 0.055, "virtual__inertia_scale": 2.0, "virtual__friction_positive_scale": 0.8,
+STICKY: dict[str, Any] = {  # 0.11 kg m^2 that break away at 14 Nm, believed to be 0.05 kg m^2
+    "joint__inertia_kgm2": 0.05, "virtual__inertia_scale": 2.2, "virtual__friction_positive_scale": 0.8,
     "virtual__friction_negative_scale": 0.75,
 }  # fmt: skip
 
