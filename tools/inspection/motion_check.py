@@ -121,13 +121,15 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
     plan = CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
     most = max(travel, min(TRAVEL_MAX_rad, TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)))
-    while plan.travel_rad < most and not passes(config_of_check(config, plan)):
-        plan = replace(plan, travel_rad=min(LONGER * plan.travel_rad, most))
     least_Nm = LEAST_FRICTIONS * static_Nm + plan.gravity_Nm if static_Nm and not given else plan.torque_Nm
-    softer = plan
-    while softer.torque_Nm > least_Nm and not passes(config_of_check(config, softer)):
-        softer = replace(softer, torque_Nm=max(softer.torque_Nm / LONGER, least_Nm))
-    return softer
+    while not passes(config_of_check(config, plan)):
+        if plan.travel_rad < most:
+            plan = replace(plan, travel_rad=min(LONGER * plan.travel_rad, most))
+        elif plan.torque_Nm > least_Nm:
+            plan = replace(plan, torque_Nm=max(plan.torque_Nm / LONGER, least_Nm))
+        else:
+            break
+    return plan
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:

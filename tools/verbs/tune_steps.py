@@ -425,14 +425,14 @@ class Tune:
         if self.config.reducer is None or self.config.joint_encoder is None:
             return {}
         unmapped = self.config.model_copy(update={"reducer": self.config.reducer.model_copy(update={"map": None})})
-        *rest, last = speeds_in_turn(self.config)
-        for speed_radps in (*rest, last):
+        speeds = speeds_in_turn(self.config)
+        for speed_radps in speeds:
             moving = config_of_map(unmapped, MapOptions(speed_radps=speed_radps))
             try:
                 carried = self.carrier.run(moving, ConfiguredMotion(moving, trajectory_table(moving)), "map")
                 break
             except LimitCycle as error:
-                if speed_radps == last:
+                if speed_radps == speeds[-1]:
                     raise
                 self.carrier.output.note(f"  {error.message}: once more, faster")
         settings, _ = loop_settings(moving)
