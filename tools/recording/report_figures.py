@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointctl.drivers.errors import decimals_of
 from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 from jointctl.tools.drawing import (
@@ -35,13 +34,13 @@ from jointctl.tools.recording.report_page import Block, Figure, Paragraph, Table
 from jointctl.tools.recording.run_log_reader import RunLog, began_at, event_rows, missing_in
 from jointctl.tools.recording.run_summary import (
     TIMES,
-    TORQUES,
     Range,
     RunSummary,
     TimeSummary,
     drawn_indices,
     powered,
     seconds,
+    torques_of,
 )
 
 if TYPE_CHECKING:
@@ -530,10 +529,8 @@ def motion_of(summary: RunSummary) -> Figures:
         ("error in the second half, RMSE [mrad]", late.rmse_rad * 1e3 if late else None, 3),
         ("within 1 mrad for good after [s]", summary.settling_s, 2),
     ]
-    for name, key in TORQUES.items():
-        torque: Range | None = getattr(summary, key)
-        digits = 2 if torque is None else decimals_of(torque.peak, 2)
-        rows += _ends(name, torque if torque is not None and torque.peak != 0.0 else None, "Nm", 1.0, digits)
+    for name, torque, digits in torques_of(summary):
+        rows += _ends(name, torque, "Nm", 1.0, digits)
     rows += _ends("temperature of the drive", summary.temperature_degC, "°C", 1.0, 1)
     return rows
 

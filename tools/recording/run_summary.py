@@ -6,7 +6,7 @@ Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -196,6 +196,15 @@ def histogram_times(histogram: np.ndarray) -> TimeSummary | None:
     return TimeSummary(total, edge_us(0.5), edge_us(0.99), edge_us(0.999), greatest, int(histogram[-1]))
 
 
+def torques_of(summary: RunSummary) -> Iterator[tuple[str, Range | None, int]]:
+    """Name, range [Nm] and decimals of each part; None where the law has no such part, which was zero all the time."""
+    for name, key in TORQUES.items():
+        torque: Range | None = getattr(summary, key)
+        if torque is not None and torque.peak == 0.0:
+            torque = None
+        yield name, torque, 2 if torque is None else decimals_of(torque.peak, 2)
+
+
 def summary_table(summary: RunSummary) -> Table:
     """The summary for a terminal; angles in mrad."""
     table = Table(Column(style="bold"), Column(justify="right"), title="Run", show_header=False, title_justify="left")
@@ -208,10 +217,8 @@ def summary_table(summary: RunSummary) -> Table:
             span = f"{error.from_s:z.1f}..{error.to_s:z.1f} s"
             table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
     table.add_row("within 1 mrad for good", _settled_text(summary))
-    for name, key in TORQUES.items():
-        torque: Range | None = getattr(summary, key)
-        if torque is not None and torque.peak != 0.0:  # zero: the law has no such part
-            digits = decimals_of(torque.peak, 2)
+    for name, torque, digits in torques_of(summary):
+        if torque is not None:
             table.add_row(name, f"{torque.least:.{digits}f} .. {torque.greatest:.{digits}f} Nm")
     for name, key in (*TIMES.items(), ("SYNC of all buses", "sync_spread")):
         times: TimeSummary | None = getattr(summary, key)
