@@ -1,7 +1,8 @@
 """Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
-    (25, 1.7 and 3 where friction rules the joint)          and lag at the late end, link at both ends of the payload
+    (31 and 2.4 of a soft joint with both encoders;         and lag at the late end, link at both ends of the payload
+    25, 1.7 and 3 where friction rules the joint)
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
     torque noise of the encoders' counts <= a share of limits.torque_max_Nm; of a soft joint LARGEST_NOISE_Nm, some
@@ -9,14 +10,13 @@
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / ripple_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
-filter, then Nelder and Mead from its best points; kp follows from kv.  A joint that is late beside its resonance bears
+filters, then Nelder and Mead from its best points; kp follows from kv.  A joint that is late beside its resonance bears
 two to seven times the kv behind a filter far below that; the link's speed, which the observer reads, is then filtered
 as well, since it drives a resonance that is hardly damped.  By this error a quick observer and a stiff loop look alike;
-on the simulated joints the quick one tracks two to three times worse, so that it costs beyond a limit, and one far from
-the usual bandwidth costs a little: the error is flat there, and its least a matter of chance.  A goal that is missed
-costs in proportion, so that the result of a joint that does not allow all of them is the nearest one, and says so.
-A light joint with much friction sticks and slides by turns under a soft loop, which no margin shows, and its wide
-intervals are those of friction that looks like inertia: it keeps less at their ends.
+on the simulated joints the quick one tracks two to three times worse, so it costs beyond a limit, and a little far from
+the usual bandwidth.  A goal that is missed costs in proportion, so that the result of a joint that does not allow all
+of them is the nearest one, and says so.  A light joint with much friction sticks and slides by turns under a soft loop,
+which no margin shows, and its wide intervals are those of friction that looks like inertia: it keeps less there.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ from jointctl.tools.analysis.linear_loop import (
     sampled_joint,
     two_masses,
 )
-from jointctl.tools.analysis.margin_gate import meets
-from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins, margins_on_grid
+from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins_on_grid
 from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
@@ -62,8 +61,7 @@ LARGEST_NOISE_Nm = 0.6
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be distinguished from an unstable one
 LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
-LEAST_STIFFNESS_SHARE = 0.1
-LEAST_LATE_s = 0.1e-3
+LEAST_STIFFNESS_SHARE, LEAST_LATE_s = 0.1, 0.1e-3
 GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
 OF_RIGID = {"computed_torque_observer": "precise", "computed_torque_rbf": "paper"}  # control.kind and its law
 NEEDED = {
@@ -74,13 +72,13 @@ SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at mo
 LEAST_DAMPING = 0.02  # of the critical one: of a strain wave gear without its hysteresis, 0.02 to 0.06
 EASED = 2.0  # share of margins that the encoder on the link alone need not keep there: it would be left with few gains
 LINK_CUTOFF = 2.0  # times the velocity filter: that of the link's velocity, at most
+USUAL_LINK_CUTOFF_Hz = 60.0  # at most as well: a lower one is quieter, and the observer damps less with it
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
 USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for another
-UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it
+UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it; of the link's filter as well
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 RIPPLE_OF_TWO_radps = 100.0  # measured, docs/law.md: what disturbs such a joint falls with the frequency up to there
-SLOW_OBSERVERS = 8  # that are tried, from the slowest on
 LEARNING_FACTOR = 0.9  # of a repetition, wanted
 SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 _LOWEST_Hz, _POINTS = 0.3, 240
@@ -117,6 +115,7 @@ class Law:
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
     ripple_radps: float = RIPPLE_radps
+    phase_margin_deg: float = PHASE_MARGIN_deg
     sensitivity: float = SENSITIVITY
     encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
     of_soft: tuple[tuple[float, float, int], ...] | None = None  # `spans` of a soft joint, where they are others
@@ -126,10 +125,14 @@ class Law:
         return max(settings.observer_radps / self.most_observer_radps - 1.0, 0.0)
 
     def unusual(self, settings: LoopSettings) -> float:
-        """What an observer far from the usual one costs, in the logarithm of the error."""
-        if self.usual_observer_radps is None:
-            return 0.0
-        return UNUSUAL * math.log(settings.observer_radps / self.usual_observer_radps) ** 2
+        """What values far from the usual ones cost, in the logarithm of the error."""
+        far = 0.0
+        if self.usual_observer_radps is not None:
+            far += math.log(settings.observer_radps / self.usual_observer_radps) ** 2
+        if "link_cutoff_Hz" in self.keys:
+            usual_Hz = min(USUAL_LINK_CUTOFF_Hz, LINK_CUTOFF * settings.cutoff_Hz)
+            far += math.log(settings.link_cutoff_Hz / usual_Hz) ** 2
+        return UNUSUAL * far
 
     def settings(self, settings: LoopSettings, logarithms: Array) -> LoopSettings:
         """With these values, to three digits."""
@@ -138,8 +141,8 @@ class Law:
         }
         if "cutoff_Hz" in values:
             values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
-            link_Hz = float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}")
-            values["link_cutoff_Hz"] = min(settings.link_cutoff_Hz or math.inf, link_Hz)  # 0: no filter
+            link_Hz = min(USUAL_LINK_CUTOFF_Hz, float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}"))
+            values["link_cutoff_Hz"] = min(values.get("link_cutoff_Hz", math.inf), link_Hz)
         values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
         if "observer_radps" in values:
             values["observer_radps"] = max(values["observer_radps"], LEAST_OBSERVER_radps)
@@ -148,8 +151,16 @@ class Law:
         return replace(settings, **values)
 
     def logarithms(self, settings: LoopSettings) -> Array:
-        """What `settings` takes."""
-        return np.log([np.max(getattr(settings, key)) for key in self.keys])
+        """What `settings` takes; of a filter of the link that only follows the velocity's, the usual one."""
+        values = {key: np.max(getattr(settings, key)) for key in self.keys}
+        if "link_cutoff_Hz" in values and values["link_cutoff_Hz"] >= LINK_CUTOFF * settings.cutoff_Hz:
+            values["link_cutoff_Hz"] = USUAL_LINK_CUTOFF_Hz
+        return np.log(list(values.values()))
+
+    def free(self, logarithms: Array) -> Array:
+        """Indices of the values that count there: the link's filter does not behind a lower one of all velocity."""
+        low = math.exp(logarithms[-1]) * LINK_CUTOFF < USUAL_LINK_CUTOFF_Hz
+        return np.array([i for i, key in enumerate(self.keys) if not (low and key == "link_cutoff_Hz")])
 
     def starts(self, best_first: list[Judged]) -> list[Array]:
         """Where to search: the best ones, each in a valley of its own, since a filter far lower bears other gains."""
@@ -161,6 +172,11 @@ class Law:
         return found[:_STARTS]
 
 
+_MOTOR_ENCODER = Law(
+    "motor_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
+    ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
+    most_noise_Nm=LARGEST_NOISE_Nm, ripple_radps=RIPPLE_OF_TWO_radps, encoders=Encoders.MOTOR,
+)  # fmt: skip
 LAWS = {
     "precise": Law(
         "precise", lambda: shipped_control("precise"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -170,11 +186,10 @@ LAWS = {
     "paper": Law(
         "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
     ),
-    "two_encoders": Law(
-        "two_encoders", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
-        ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
-        most_noise_Nm=LARGEST_NOISE_Nm, ripple_radps=RIPPLE_OF_TWO_radps,
-        sensitivity=2.4, encoders=Encoders.BOTH,  # 2 is far softer where much is late
+    "two_encoders": replace(
+        _MOTOR_ENCODER, name="two_encoders", keys=("kv", "observer_radps", "link_cutoff_Hz", "cutoff_Hz"),
+        spans=((4.0, 60.0, 6), (12.0, 110.0, 6), (30.0, USUAL_LINK_CUTOFF_Hz, 2), (8.0, 450.0, 3)),
+        phase_margin_deg=31.0, sensitivity=2.4, encoders=Encoders.BOTH,  # 35 and 2 are far softer where much is late
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -185,7 +200,7 @@ LAWS = {
 _FLEXIBLE = {  # by what the law of a flexible joint reads
     Encoders.BOTH: LAWS["two_encoders"],
     Encoders.LINK: LAWS["link_encoder"],
-    Encoders.MOTOR: replace(LAWS["two_encoders"], name="motor_encoder", sensitivity=2.0, encoders=Encoders.MOTOR),
+    Encoders.MOTOR: _MOTOR_ENCODER,
 }
 
 
@@ -346,7 +361,7 @@ def _payload_given(config: Config) -> bool:
     return "payload_range" in config.margin.model_fields_set
 
 
-def _latest_s(settings: LoopSettings, intervals: Intervals) -> float:
+def latest_s(settings: LoopSettings, intervals: Intervals) -> float:
     """The loop delay at the late end."""
     return settings.delay_s + max(intervals.late_s, LEAST_LATE_s)
 
@@ -359,7 +374,7 @@ class _Search:
         self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
         # the late end of delay and lag for all of them
-        late_s = _latest_s(settings, intervals)
+        late_s = latest_s(settings, intervals)
         within = joints_within(config, intervals)
         joints = [sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders) for joint in within]
         self._of_goals = len(joints)
@@ -459,7 +474,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     from scipy.optimize import minimize  # here: only a search waits for it
 
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
-    ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
+    ends = zip((law.phase_margin_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s, *wanted)
     search = _Search(config, law, intervals, settings)
@@ -486,9 +501,16 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
             return cost(one, least_error)
 
         def lowest_from(x: Array, step: float) -> Judged:
+            free = law.free(x)
+
+            def near(values: Array) -> float:
+                there = x.copy()
+                there[free] = values
+                return of(search.judged(there))
+
             options = {"maxfev": _EVALUATIONS, "xatol": 0.01, "fatol": 0.01,
-                       "initial_simplex": x + step * np.vstack((np.zeros(len(x)), np.eye(len(x))))}  # fmt: skip
-            minimize(lambda x: of(search.judged(x)), x, method="Nelder-Mead", options=options)
+                       "initial_simplex": x[free] + step * np.eye(len(free) + 1, len(free), -1)}  # fmt: skip
+            minimize(near, x[free], method="Nelder-Mead", options=options)
             return min(search.tried, key=of)
 
         for x in law.starts(sorted(search.tried, key=of)):
@@ -574,23 +596,3 @@ def converging(settings: LoopSettings, learning: Learning | None) -> Learning | 
             update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
         )
     return slow
-
-
-def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) -> Config:
-    """With an observer of at most that bandwidth, or as slow as the gate allows at the late end of delay and lag.
-
-    With both encoders of a soft joint the observer damps the link, too: it cannot be as slow as one likes.
-    """
-    chosen_radps = config.control.observer_radps
-    if chosen_radps <= most_radps:
-        return config
-    settings, _ = loop_settings(config)
-    settings = replace(settings, delay_s=_latest_s(settings, intervals))
-    for radps in np.linspace(most_radps, chosen_radps, SLOW_OBSERVERS):
-        observer_radps = float(f"{radps:.3g}")
-        slower = replace(settings, observer_radps=observer_radps)
-        if meets(margins(slower), config.margin.min_phase_margin_deg):
-            return config.model_copy(
-                update={"control": config.control.model_copy(update={"observer_radps": observer_radps})}
-            )
-    return config

@@ -21,8 +21,10 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
+from jointctl.tools.analysis.gains import Intervals, latest_s
 from jointctl.tools.analysis.linear_loop import loop_settings
-from jointctl.tools.analysis.margin_gate import passes, require_margin
+from jointctl.tools.analysis.margin_gate import meets, passes, require_margin
+from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import static_friction_Nm
 from jointctl.tools.configuration.found_values import Found, rounded, with_sliding, with_values
@@ -59,6 +61,8 @@ from jointctl.tools.tuning.frequency_response import (
     speed_and_period,
 )
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
+
+SLOW_OBSERVERS = 8  # that are tried, from the slowest on
 
 
 class TooWeak(MotionFault):
@@ -308,6 +312,26 @@ def _whole(
     if before is not None:
         _refuse_growth(before, found)
     return found, records, plan
+
+
+def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) -> Config:
+    """With an observer of at most that bandwidth, or as slow as the gate allows at the late end of delay and lag.
+
+    With both encoders of a soft joint the observer damps the link, too: it cannot be as slow as one likes.
+    """
+    chosen_radps = config.control.observer_radps
+    if chosen_radps <= most_radps:
+        return config
+    settings, _ = loop_settings(config)
+    settings = replace(settings, delay_s=latest_s(settings, intervals))
+    for radps in np.linspace(most_radps, chosen_radps, SLOW_OBSERVERS):
+        observer_radps = float(f"{radps:.3g}")
+        slower = replace(settings, observer_radps=observer_radps)
+        if meets(margins(slower), config.margin.min_phase_margin_deg):
+            return config.model_copy(
+                update={"control": config.control.model_copy(update={"observer_radps": observer_radps})}
+            )
+    return config
 
 
 # --- the laws of a response whose joint has a friction that is not known yet ---

@@ -34,7 +34,6 @@ from jointctl.tools.analysis.gains import (
     apart,
     choose_gains,
     require_encoders,
-    with_slow_observer,
 )
 from jointctl.tools.analysis.linear_loop import loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import require_margin
@@ -79,6 +78,7 @@ from jointctl.tools.tuning.carry_out import (
     task_by,
     verifying_motion,
     with_motion,
+    with_slow_observer,
 )
 from jointctl.tools.tuning.frequency_response import (
     FrequencyResponse,
