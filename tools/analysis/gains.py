@@ -1,7 +1,7 @@
 """Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
-    (31 and 2.4 of a soft joint with both encoders;         and lag at the late end, link at both ends of the payload
+    (33 and 2.4 of a soft joint with both encoders;         and lag at the late end, link at both ends of the payload
     25, 1.7 and 3 where friction rules the joint)
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
@@ -57,12 +57,12 @@ PENALTY = 30.0  # for each share by which a goal is missed
 UNSTABLE = 1e3
 KP_OF_KV = 1.5  # of kv^2, for the law of a flexible joint: with less damping a joint a little different is unstable
 LARGEST_OBSERVER_radps = 110.0  # of that law, for the same reason
-LARGEST_NOISE_Nm = 0.6
+LARGEST_NOISE_Nm = 0.55
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be distinguished from an unstable one
 LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
 LEAST_STIFFNESS_SHARE, LEAST_LATE_s = 0.1, 0.1e-3
-GRID_SPARE = 0.97  # of the gate's peak of |S|: the gate looks between the frequencies of the grid
+GRID_SPARE = 0.97  # of the gate's margins: the gate looks between the frequencies of the grid
 OF_RIGID = {"computed_torque_observer": "precise", "computed_torque_rbf": "paper"}  # control.kind and its law
 NEEDED = {
     Encoders.BOTH: "[joint_encoder] beside an encoder on the motor",
@@ -71,7 +71,7 @@ NEEDED = {
 SOFTEST = 0.5  # of the stiffness of a small motion: hysteresis doubles it at most
 LEAST_DAMPING = 0.02  # of the critical one: of a strain wave gear without its hysteresis, 0.02 to 0.06
 EASED = 2.0  # share of margins that the encoder on the link alone need not keep there: it would be left with few gains
-LINK_CUTOFF = 2.0  # times the velocity filter: that of the link's velocity, at most
+LINK_CUTOFF = 4.0  # times the velocity filter: that of the link's velocity, at most
 USUAL_LINK_CUTOFF_Hz = 60.0  # at most as well: a lower one is quieter, and the observer damps less with it
 HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
 QUICKEST_OBSERVER_radps = 45.0  # of the precise law
@@ -189,7 +189,7 @@ LAWS = {
     "two_encoders": replace(
         _MOTOR_ENCODER, name="two_encoders", keys=("kv", "observer_radps", "link_cutoff_Hz", "cutoff_Hz"),
         spans=((4.0, 60.0, 6), (12.0, 110.0, 6), (30.0, USUAL_LINK_CUTOFF_Hz, 2), (8.0, 450.0, 3)),
-        phase_margin_deg=31.0, sensitivity=2.4, encoders=Encoders.BOTH,  # 35 and 2 are far softer where much is late
+        phase_margin_deg=33.0, sensitivity=2.4, encoders=Encoders.BOTH,  # 35 and 2 are far softer where much is late
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -267,7 +267,7 @@ class Goals:
             f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
                 math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
             f"torque noise {text_Nm(one.noise_Nm, 2)}, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
-            f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:g} deg":
+            f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:.3g} deg":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
             f"|S| of the gate {one.gate_sensitivity:.2f}, {self.gate_sensitivity:.3g} at most":
                 one.gate_sensitivity / self.gate_sensitivity - 1.0,
@@ -476,7 +476,8 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
     ends = zip((law.phase_margin_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
-    goals = Goals(noise_Nm, config.margin.min_phase_margin_deg, GRID_SPARE * settings.largest_s, *wanted)
+    gate_deg, gate_s = config.margin.min_phase_margin_deg / GRID_SPARE, GRID_SPARE * settings.largest_s
+    goals = Goals(noise_Nm, gate_deg, gate_s, *wanted)
     search = _Search(config, law, intervals, settings)
     spans = law.spans if config.reducer is None or law.of_soft is None else law.of_soft
 

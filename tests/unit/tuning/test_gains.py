@@ -120,7 +120,7 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> 
     judged = margins(loop_settings(changed(config, control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert found.best.settings.observer_radps < 120.0
-    assert found.best.noise_Nm < 0.61  # 1.8 Nm were 3 % of this joint's torque
+    assert found.best.noise_Nm < 0.56  # 1.8 Nm were 3 % of this joint's torque
     assert found.control.adaptation is not None
 
 
@@ -234,7 +234,7 @@ def test_a_late_joint_gets_the_loop_that_holds_what_disturbs_a_motion() -> None:
 def test_a_noisy_encoder_of_the_link_gets_a_lower_filter_and_leaves_a_quicker_observer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Noise of 0.6 Nm left an observer of 71 rad/s behind 60 Hz; of an encoder with more counts 60 Hz cost nothing."""
+    """The noise that is allowed left an observer of 71 rad/s behind 60 Hz; of an encoder with more counts 60 Hz cost nothing."""
     settings, _ = loop_settings(config := of_study(71193, 28))
     found = gains_of_file(config, settings)
     both = LAWS["two_encoders"]
@@ -253,7 +253,7 @@ def test_a_lower_filter_of_the_link_costs_a_little_unless_it_follows_the_other_o
     law, settings = LAWS["two_encoders"], replace(loop_settings(shipped("realistic"))[0], cutoff_Hz=450.0)
     costs = [law.unusual(replace(settings, link_cutoff_Hz=link_Hz)) for link_Hz in (60.0, 30.0, 15.0)]
     assert costs == pytest.approx([0.0, UNUSUAL * math.log(2.0) ** 2, UNUSUAL * math.log(4.0) ** 2])
-    assert law.unusual(replace(settings, cutoff_Hz=10.0, link_cutoff_Hz=20.0)) == 0.0
+    assert law.unusual(replace(settings, cutoff_Hz=5.0, link_cutoff_Hz=20.0)) == 0.0
 
 
 def test_the_search_goes_on_from_a_simplex_that_has_shrunk_in_a_curved_valley() -> None:
@@ -304,7 +304,7 @@ def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing(
     found = choose_gains(known(shipped("realistic", margin__min_phase_margin_deg=89.0), fit), fit.intervals())
     (name, share), *others = found.missed.items()
     assert name.startswith("phase margin of the gate")
-    assert name.endswith("of 89 deg")
+    assert name.endswith("of 91.8 deg")  # 3 % are kept for what the grid leaves out
     assert 0.0 < share < 1.0
     assert not others
 
