@@ -275,7 +275,7 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
             job = Tune(guess, TuneOptions(lockstep=True), carrier, Path(folder))
             with patch.object(sweeping, "sweep_in_lockstep", carrier.sweep):
-                job.carry_out("")
+                job.carry_out()
     except JointctlError as error:
         return {**row, "failed": error.message}
     whole_s = time.process_time() - started

@@ -25,8 +25,9 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config, ConfigurationProblems
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.found_values import with_break_away
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import load_config, moved, shipped_config
 from jointctl.tools.configuration.sections import Trapezoid
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
@@ -267,6 +268,68 @@ def test_an_interruption_offers_to_go_on_only_where_a_step_was_done(
     assert ("no step was done" in err.getvalue()) == (step == "direction")
 
 
+def resumed(path: Path, config: Config, *, lockstep: bool = True) -> Tune:
+    """A tune that goes on with the steps in its folder, up to its first step."""
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    job = Tune(config, TuneOptions(lockstep=lockstep, resume=True), carrier, path.with_suffix(".tune"))
+    job._open()
+    return job
+
+
+def begun_tune(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The configuration of a simulated tune that was interrupted after its first step."""
+    monkeypatch.setattr(Tune, "_step_direction", lambda _: [])
+    monkeypatch.setattr(Tune, "_step_response", Mock(side_effect=KeyboardInterrupt))
+    path = written(folder / "joint.toml", "precise")
+    assert tune(load_config(path), outputs()[0], options=TuneOptions(lockstep=True)) == 130
+    return path
+
+
+def test_a_real_joint_does_not_go_on_with_the_steps_of_the_simulated_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor another joint on the bus: its directions were not looked at."""
+    path = begun_tune(tmp_path, monkeypatch)
+    config = load_config(path)
+    with pytest.raises(DataError, match="of a simulated joint instead of a real one"):
+        resumed(path, config, lockstep=False)
+    for elsewhere in (GivenPlace(channel="other"), GivenPlace(node=5)):
+        with pytest.raises(DataError, match="of another drive"):
+            resumed(path, moved(config, elsewhere, {}))
+
+
+def test_its_twin_goes_on_with_those_of_the_same_joint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = begun_tune(tmp_path, monkeypatch)
+    assert resumed(path, load_config(path)).state == {"direction": []}
+
+
+@pytest.mark.parametrize("damaged", ["[]", "7", "[" * 2000, '{"about": 3}'])
+def test_steps_that_mean_nothing_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damaged: str) -> None:
+    path = begun_tune(tmp_path, monkeypatch)
+    (path.with_suffix(".tune") / "steps.json").write_text(damaged)
+    with pytest.raises(DataError, match=r"steps\.json"):
+        resumed(path, load_config(path))
+
+
+def test_a_file_that_was_changed_during_the_tune_is_left_as_it_is(wrong: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit that its user has narrowed in the meantime must not be as wide again, nor count for steps before it."""
+    config, narrower = load_config(wrong), wrong.read_text().replace("position_max_rad = 0.7", "position_max_rad = 0.5")
+    assert narrower != config.text
+    begin = Tune.run
+
+    def edited(job: Tune) -> int:
+        wrong.write_text(narrower)  # while the question is open
+        return begin(job)
+
+    monkeypatch.setattr(Tune, "run", edited)
+    with pytest.raises(DataError, match="was changed during the tune, and is left as it is"):
+        tune(config, outputs()[0], options=TuneOptions(lockstep=True))
+    assert wrong.read_text() == narrower
+    assert "95 %" in (wrong.with_suffix(".tune") / "tuned.toml").read_text()
+    with pytest.raises(DataError, match="is of another configuration"):
+        resumed(wrong, load_config(wrong))
+
+
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:
     path = written(tmp_path / "soft.toml", "realistic")
     output, out, _ = outputs()
@@ -358,7 +421,7 @@ def test_gains_that_measure_better_bring_their_own_margins(wrong: Path, monkeypa
     output, *_ = outputs()
     silent = TerminalConsent(output, assume_yes=True)
     job = Tune(load_config(wrong), TuneOptions(lockstep=True, refine=True), Carrier(output, silent, None), wrong.parent)
-    job.carry_out("")
+    job.carry_out()
     gains, kept = job.gains, job.state["gains"]
     assert gains is not None
     assert len(job.state["refinement"]["runs"]) > 1

@@ -374,8 +374,10 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
         while plan_motion(points, chosen, options.warm_up_turns).duration_s > QUICK_S and count > QUICK_LEAST:
             count -= 4
             points = ordered(grid(count))
-    warming = {"warm_between_turns": options.warm_between_turns} if options.warm_between_turns else {}
-    identity = plan_hash(points, asdict(chosen) | measuring_constants(config) | warming)
+    other: dict[str, float] = {"warm_between_turns": options.warm_between_turns} if options.warm_between_turns else {}
+    if options.lockstep:  # what was simulated and what was measured are two sweeps
+        other["simulated"] = True
+    identity = plan_hash(points, asdict(chosen) | measuring_constants(config) | other)
     return SweepPlan(points, chosen, identity, options.warm_between_turns)
 
 

@@ -27,7 +27,7 @@ from jointctl.drivers.errors import (
     one_line,
     text_Nm,
 )
-from jointctl.firmware_py.input_file import read_input
+from jointctl.firmware_py.input_file import parse_json, read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.gains import (
     ChosenGains,
@@ -51,7 +51,7 @@ from jointctl.tools.configuration.found_values import (
     with_values,
     without_friction,
 )
-from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.load import load_config, read_text
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.configuration.sections import ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
@@ -96,7 +96,8 @@ from jointctl.tools.verbs.tune_report import values_of, write_report
 from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
-STATE = "steps.json"
+STATE, ANEW = "steps.json", "without --resume it begins anew"
+OTHER = "of another drive, or of a simulated joint instead of a real one"
 FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
@@ -167,14 +168,13 @@ class Tune:
 
     def run(self) -> int:
         """All steps that are not done yet; then the file and the report."""
-        text = read_input(self.original.path).decode("utf-8-sig")
-        self.carry_out(hashlib.sha256(text.encode()).hexdigest())
-        self._write(text)
+        self.carry_out()
+        self._write()
         return 0
 
-    def carry_out(self, digest: str) -> None:
-        """The steps alone; `digest` of the configuration that they are for."""
-        self._open(digest)
+    def carry_out(self) -> None:
+        """The steps alone."""
+        self._open()
         for name in STEPS:
             step: Callable[[], Any] = getattr(self, f"_step_{name}")
             done = name in self.state
@@ -193,23 +193,23 @@ class Tune:
         if self.options.refine:
             self._refine()
 
-    def _open(self, digest: str) -> None:
+    def _open(self) -> None:
         prepare_folder(self.folder)
-        path = self.folder / STATE
-        about = {"configuration": digest, "torque_Nm": self.config.limits.torque_max_Nm}
+        path, original = self.folder / STATE, self.original
+        about = {
+            "configuration": hashlib.sha256(original.text.encode()).hexdigest(),
+            "torque_Nm": self.config.limits.torque_max_Nm, "simulated": self.options.lockstep,
+            "bus": original.bus.model_dump(mode="json"), "drive": original.drive.model_dump(mode="json"),
+        }  # fmt: skip
         asked = [self.options.law, self.options.objective]
         if self.options.resume:
             try:
-                kept = json.loads(path.read_text())
-            except (OSError, ValueError) as error:
-                why = error.strerror if isinstance(error, OSError) else str(error)
-                raise DataError(f"{path}: cannot be read: {why}", "without --resume it begins anew") from None
-            own = kept.get("about", {})
+                kept = dict(parse_json(read_input(path)))
+                own = dict(kept.get("about", {}))
+            except (OSError, ValueError, TypeError) as error:
+                raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}", ANEW) from None
             if about not in (own, {**own, "configuration": kept.get("written")}):
-                raise DataError(
-                    f"{path}: is of another configuration or torque than {self.original.path}",
-                    "without --resume it begins anew",
-                )
+                raise DataError(f"{path}: is of another configuration or torque than {original.path}, {OTHER}", ANEW)
             steps = STEPS if kept.get("asked") == asked else STEPS[: STEPS.index("gains")]  # another law or objective
             self.state = {name: kept[name] for name in steps if name in kept}
         elif not self.carrier.consent.dry_run:
@@ -574,23 +574,26 @@ class Tune:
 
     # --- 9. what is written ---
 
-    def _write(self, text: str) -> None:
-        values = values_of(self)
+    def _write(self) -> None:
+        values, path, text = values_of(self), self.original.path, self.original.text
         friction = self.state["friction"]
         sources: dict[str, list[str]] = {}
-        for one in values:
-            if one.source:
-                sources.setdefault(".".join(one.section), []).append(f"{one.key} = {one.source}")
+        for one in filter(lambda one: one.source, values):
+            sources.setdefault(".".join(one.section), []).append(f"{one.key} = {one.source}")
         sources["friction"] = [f"{friction['points']} points, RMSE {friction['rmse_Nm']:.2g} Nm at the motor"]
         if self.state["map"]:
             sources["reducer.map"] = ["one motion both ways"]
         content = with_tuned(text, values, sources).encode()
-        replace_file(self.original.path, content, _require_valid)
+        if read_text(path) != text:  # a limit that was narrowed in these minutes must not be as wide again
+            kept = self.folder / "tuned.toml"
+            replace_file(kept, content)
+            raise DataError(f"{path}: was changed during the tune, and is left as it is", f"{kept} has what was found")
+        replace_file(path, content, _require_valid)
         replace_file(self.folder / "before.toml", text.encode())
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
-        write_report(self, [[".".join(one.section), one.key, one.value] for one in values_of(self)])
-        self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
+        write_report(self, [[".".join(one.section), one.key, one.value] for one in values])
+        self.carrier.output.note(f"written: {path}; as it was: {self.folder / 'before.toml'}")
 
 
 def _require_valid(path: Path) -> None:

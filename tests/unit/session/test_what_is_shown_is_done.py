@@ -260,6 +260,11 @@ def test_points_that_were_measured_with_other_constants_are_another_plan(
     assert (make_plan(edited(tmp_path, change), options).hash == first) is same
 
 
+def test_a_simulated_sweep_is_another_one_than_a_measured_one(tmp_path: Path) -> None:
+    config = edited(tmp_path)
+    assert make_plan(config, SweepOptions(lockstep=True)).hash != make_plan(config, SweepOptions()).hash
+
+
 # --- what a drive adds to its target by itself ---
 class Offsets:
     """Objects of a drive that is off."""
