@@ -311,21 +311,25 @@ class LiveMotor:
             drive_end.require_off(self._session.drive_state)
 
     def _end(self) -> None:
-        """Ask for the end, and wait for it; Ctrl-C in between asks for more, as in `jointctl run`."""
+        """Ask for the end, and wait for it whatever is raised here meanwhile: by a signal of the program's, say.
+
+        Ctrl-C asks for more, as in `jointctl run`.
+        """
         control, thread = self._control, self._thread
         if control is None or thread is None or thread.ident is None:
             return
         signals = control.signals
-        if not signals.count:
-            signals.name, signals.count = signals.name or WHO, 1
-        interrupted = False
+        raised: BaseException | None = None
         while not self._over:
             try:
+                signals.name, signals.count = signals.name or WHO, max(signals.count, 1)
                 self._join()
-            except KeyboardInterrupt:
-                signals.count, interrupted = signals.count + 1, True
-        if interrupted:
-            raise KeyboardInterrupt
+            except KeyboardInterrupt as error:
+                signals.count, raised = signals.count + 1, error
+            except BaseException as error:
+                raised = error
+        if raised is not None:
+            raise raised
 
     def _join(self) -> None:
         while not self._over:

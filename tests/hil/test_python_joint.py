@@ -144,6 +144,25 @@ def test_ctrl_c_while_it_stops_returns_when_the_drive_is_off(bench: Any) -> None
     assert bench.disabled()
 
 
+@pytest.mark.parametrize("error", ["SystemExit(3)", "TimeoutError('mine')"])
+def test_what_a_signal_raises_while_the_block_is_left_comes_when_the_drive_is_off(bench: Any, error: str) -> None:
+    """A handler of the program's own, as for SIGTERM or a time-out."""
+    body = f"""
+    import signal
+    def ends(*_): raise {error}
+    signal.signal(signal.SIGALRM, ends)
+    joint.move_to(0.6, duration_s=4.0, wait=False)
+    joint.wait(1.5)
+    signal.setitimer(signal.ITIMER_REAL, 0.3)
+    try: joint.stop()
+    except BaseException as error: say(f"stopped: {{joint.state.drive_state}} ({{error!r}})")
+    """
+    ended = started(bench, body, sequence__release_s=2.0).finished(60.0)
+    assert f"stopped: switch on disabled ({error})" in ended.err
+    assert phases(bench)[-5:] == RAMPED
+    assert bench.disabled()
+
+
 def test_the_state_is_none_once_the_loop_has_died(bench: Any) -> None:
     program = started(bench, "while joint.state.phase == 'tracking': time.sleep(0.05)").saw("enabled")
     for process in processes_in(bench.folder):
