@@ -40,7 +40,7 @@ from jointctl.tools.session.set_points import RemoteSetPoint
 
 BACKLOG = 256  # messages for a client that does not read: 1 s of all topics
 GAIN = "control."  # before the name of a gain
-REFUSED = "set-point"  # id of the status that reports one
+REFUSED = "set-point"  # id of the status that reports a refusal
 REFUSED_S = 0.2  # between two reports
 MOST_CLIENTS = 32  # in one report
 CLOSED = "{} can be changed only where --allow-remote was given at the bench"
@@ -151,15 +151,17 @@ class FoxgloveView(ServerListener):
 
     # --- what clients ask for ---
 
-    def _tell(self, text: str, level: StatusLevel = StatusLevel.Warning, name: str | None = None) -> None:
-        if self._server is not None:
-            self._server.publish_status(text, level, name)
-
     def _refused(self, who: str, words: str) -> None:
-        """Every client gets to know, but no client can flood the others by what it is refused."""
+        self._report(who, f"set-point of {who} refused: {words}")
+
+    def _report(self, who: str, text: str) -> None:
+        """Every client gets to know, but no client can flood the others by what it is refused.
+
+        The SDK's server cuts off a client that does not keep up, and its STOP with it.
+        """
         with self._lock:
             if who in self._refusals or len(self._refusals) < MOST_CLIENTS:
-                self._refusals[who] = words
+                self._refusals[who] = text
         self._tell_refusals()
 
     def _tell_refusals(self) -> None:
@@ -168,8 +170,9 @@ class FoxgloveView(ServerListener):
             if not self._refusals or now_s - self._told_s < REFUSED_S:
                 return
             refusals, self._refusals, self._told_s = self._refusals, {}, now_s
-        for who, words in refusals.items():
-            self._tell(f"set-point of {who} refused: {words}", name=REFUSED)
+        for text in refusals.values():
+            if self._server is not None:
+                self._server.publish_status(text, StatusLevel.Warning, REFUSED)
 
     def _stop(self, request: ServiceRequest) -> bytes:
         taken, words = self.way.stop(client_name(request.client_id))
@@ -187,16 +190,17 @@ class FoxgloveView(ServerListener):
         """New gains go to the supervisor's gate; what is returned is in force until the loop has taken them."""
         given = {found.name.removeprefix(GAIN): found.get_value() for found in parameters}
         if not self._order.allow_remote:
-            self._tell(CLOSED.format("gains"))
+            self._report(client_name(client.id), CLOSED.format("gains"))
         elif not self.way.ask("gains", client_name(client.id), given):
-            self._tell(f"gains {NOT_TAKEN}")
+            self._report(client_name(client.id), f"gains {NOT_TAKEN}")
         return [found for found in self._parameters() if found.name.removeprefix(GAIN) in given]
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
         self._topics[client.id, channel.id] = channel
         if channel.topic != self._command_topic or channel.encoding != "json":
-            self._tell(f"{client_name(client.id)}: {channel.topic} ({channel.encoding}) means nothing here; "
-                       f"set-points are JSON on {self._command_topic}")  # fmt: skip
+            who = client_name(client.id)
+            self._report(who, f"{who}: {channel.topic[:80]} ({channel.encoding[:20]}) means nothing here; "
+                         f"set-points are JSON on {self._command_topic}")  # fmt: skip
 
     def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
         self._topics.pop((client.id, client_channel_id), None)

@@ -37,6 +37,7 @@ NICE = 5  # a viewer comes after the supervisor, but STOP has to arrive on a bus
 AFTER_END_S = 1.5  # for clients to get the last messages
 SET_POINTS_HZ = 1000.0  # of one server, at most
 BURST = 100  # that may come at once
+ASKS_HZ, ASKS_BURST = 20.0, 20  # of other requests: STOP has to find room behind them
 
 
 class Watcher(Protocol):
@@ -110,6 +111,25 @@ class Feed(threading.Thread):
         return True
 
 
+class Allowance:
+    """So many a second, of whatever clients send, and `burst` at once; from any thread."""
+
+    def __init__(self, rate_Hz: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate_Hz, self._burst, self._clock = rate_Hz, burst, clock
+        self._left, self._counted_s = float(burst), clock()
+        self._lock = threading.Lock()
+
+    def take(self) -> bool:
+        """Whether one more may pass."""
+        with self._lock:
+            now_s = self._clock()
+            self._left = min(self._burst, self._left + (now_s - self._counted_s) * self._rate_Hz)
+            self._counted_s = now_s
+            passes = self._left >= 1.0
+            self._left -= 1.0 if passes else 0.0
+            return passes
+
+
 class SetPointLink:
     """Set-points to the supervisor; what it refuses comes back to `refused(who, words)`, in a thread.
 
@@ -119,9 +139,8 @@ class SetPointLink:
     def __init__(
         self, end: socket.socket, refused: Callable[[str, str], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._end, self._refused, self._clock = end, refused, clock
-        self._left, self._counted_s = float(BURST), clock()
-        self._lock = threading.Lock()
+        self._end, self._refused = end, refused
+        self._allowance = Allowance(SET_POINTS_HZ, BURST, clock)
         threading.Thread(target=self._listen, name="refusals", daemon=True).start()
 
     def _listen(self) -> None:
@@ -132,20 +151,13 @@ class SetPointLink:
 
     def send(self, point: RemoteSetPoint) -> None:
         """Pass it on, or refuse it here."""
-        with self._lock:
-            now_s = self._clock()
-            self._left = min(BURST, self._left + (now_s - self._counted_s) * SET_POINTS_HZ)
-            self._counted_s = now_s
-            if full := self._left < 1.0:
-                words = f"more than {SET_POINTS_HZ:g} set-points a second"
-            else:
-                self._left -= 1.0
-                try:
-                    self._end.send(json.dumps(asdict(point)).encode(), socket.MSG_DONTWAIT)
-                except OSError:
-                    full, words = True, "not taken: jointctl does not listen, or cannot keep up"
-        if full:
-            self._refused(point.who, words)
+        if not self._allowance.take():
+            self._refused(point.who, f"more than {SET_POINTS_HZ:g} set-points a second")
+            return
+        try:
+            self._end.send(json.dumps(asdict(point)).encode(), socket.MSG_DONTWAIT)
+        except OSError:
+            self._refused(point.who, "not taken: jointctl does not listen, or cannot keep up")
 
 
 # --- What the servers of Foxglove and ROS 2 have in common: log records at 100 Hz, wall-clock times, the way back ---
@@ -209,8 +221,9 @@ class WayBack:
 
     def __init__(self, order: RemoteOrder, view: LiveView, refused: Callable[[str, str], None]) -> None:
         self._feed = Feed(socket.socket(fileno=order.feed_fd), view)
-        self._set_points = SetPointLink(socket.socket(fileno=order.set_points_fd), refused)
-        self.set_point = self._set_points.send
+        self._link = SetPointLink(socket.socket(fileno=order.set_points_fd), refused)
+        self._asks = Allowance(ASKS_HZ, ASKS_BURST)
+        self.set_point = self._link.send
 
     def ready(self) -> None:
         """Clients can come from now on."""
@@ -226,8 +239,8 @@ class WayBack:
         return strength > 0, ("", "STOP taken; again: quick stop", "STOP taken: quick stop")[strength] or NOT_TAKEN
 
     def ask(self, kind: str, who: str, values: Mapping[str, object] | None = None) -> bool:
-        """A request; whether it was taken."""
-        return self._feed.ask(ViewerRequest(kind, who, values or {}))
+        """A request; whether it was taken: of a flood only some are, so that a STOP still gets through."""
+        return self._asks.take() and self._feed.ask(ViewerRequest(kind, who, values or {}))
 
 
 def stand_aside(loop_cpu: int | None) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,10 +26,10 @@ from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.recording.run_log import INFO, WARNING
 from jointctl.tools.scoping import remote
 from jointctl.tools.scoping.feed import LATE_S, ScopeFeed
-from jointctl.tools.scoping.foxglove_server import set_point_of
+from jointctl.tools.scoping.foxglove_server import FoxgloveView, set_point_of
 from jointctl.tools.scoping.remote import EnabledFromElsewhere, joint_name
 from jointctl.tools.scoping.remote_options import RemoteOptions, check_remote, foxglove_place, with_values
-from jointctl.tools.scoping.supervisor_link import BURST, NICE, SetPointLink, stand_aside
+from jointctl.tools.scoping.supervisor_link import ASKS_BURST, BURST, NICE, SetPointLink, WayBack, stand_aside
 from jointctl.tools.session.display import ViewerRequest
 from jointctl.tools.session.loop_memory import SharedBlock
 from jointctl.tools.session.loops import loop_of
@@ -298,6 +300,42 @@ def test_a_flood_does_not_reach_the_supervisor(ends: Any) -> None:
     clock.s = 1.0
     link.send(RemoteSetPoint("x", 0.0))
     assert "jointctl does not listen" in refused[-1]
+
+
+@pytest.fixture
+def way(ends: Any) -> Iterator[WayBack]:
+    """To a supervisor that reads nothing."""
+    ours, theirs = socket.socketpair()
+    order: Any = SimpleNamespace(feed_fd=ends[1].detach(), set_points_fd=theirs.detach())
+    way = WayBack(order, Mock(), lambda who, words: None)
+    yield way
+    with ours, way._feed._end, way._link._end:
+        ours.shutdown(socket.SHUT_RDWR)
+
+
+def test_behind_a_flood_of_requests_there_is_room_for_stop(way: WayBack) -> None:
+    taken = [way.ask("gains", "a client", {"kp": 700.0}) for _ in range(5000)]
+    assert not all(taken)
+    assert way.stop("another client") == (True, "STOP taken; again: quick stop")
+
+
+def test_its_twin_a_few_requests_are_all_taken(way: WayBack) -> None:
+    assert all(way.ask("gains", "a client", {"kp": 700.0}) for _ in range(ASKS_BURST))
+
+
+def test_what_a_client_is_refused_does_not_flood_the_others() -> None:
+    """A client that cannot keep up is cut off, and its STOP with it."""
+    view: Any = FoxgloveView.__new__(FoxgloveView)
+    view._order, view._server = SimpleNamespace(allow_remote=False, joint="arm"), Mock()
+    view._refusals, view._told_s, view._lock, view._topics, view._shown = {}, -1.0, threading.Lock(), {}, {}
+    view.view = SimpleNamespace(settings={})
+    client: Any = SimpleNamespace(id=1)
+    for number in range(1000):
+        view.on_set_parameters(client, [])
+        view.on_client_advertise(client, SimpleNamespace(id=number, topic="/x", encoding="json"))
+    told = [call.args[0] for call in view._server.publish_status.call_args_list]
+    assert told[0] == "gains can be changed only where --allow-remote was given at the bench"
+    assert len(told) < 100
 
 
 @pytest.mark.parametrize(
