@@ -458,11 +458,7 @@ class Dialogue:
         return self.ask(encode(name, index))
 
     def number(self, name: str, index: int | None = None) -> float:
-        text = self.query(name, index)
-        try:
-            return float(text)
-        except ValueError:
-            raise DeviceError(f"{_shown(name, index)} (={text!r}) of the drive is not a number") from None
+        return finite_number(_shown(name, index), self.query(name, index))
 
     def integer(self, name: str, index: int | None = None) -> int:
         """The value as a whole number."""
@@ -495,6 +491,14 @@ class Dialogue:
     def command(self, name: str) -> None:
         """A command without value, such as BG; sent once, because it may act twice."""
         self.ask(encode(name), 1)
+
+
+def finite_number(shown: str, text: str) -> float:
+    """`DeviceError` for what is none, such as the nan that noise may make of a reply."""
+    with contextlib.suppress(ValueError):
+        if math.isfinite(number := float(text)):
+            return number
+    raise DeviceError(f"{shown} (={text!r}) of the drive is not a number")
 
 
 def _differ(found: float, wanted: float) -> bool:

@@ -23,6 +23,7 @@ from jointctl.drivers.elmo.dialogue import (
     changed,
     encode,
     error_text,
+    finite_number,
     motor_fault_text,
     motor_off_cause,
     status_text,
@@ -107,10 +108,7 @@ def read_facts(line: Dialogue, settings: ElmoSettings) -> list[Fact]:
 def _fact(shown: str, label: str, text: str, kind: str, settings: ElmoSettings) -> Fact:
     if not kind:
         return Fact(shown, label, text, "")
-    try:
-        number = float(text)
-    except ValueError:
-        raise DeviceError(f"{shown} (={text!r}) of the drive is not a number") from None
+    number = finite_number(shown, text)
     whole = round(number)
     words = _words(kind, whole)
     if words:

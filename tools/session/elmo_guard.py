@@ -53,10 +53,10 @@ ENDED_S = 25.0  # for a run to end, and a drive that is silent to be tried again
 
 def received_line(peer: socket.socket, timeout_s: float = ANSWER_S) -> dict[str, Any] | None:
     """One message; None where none comes in time or it is none."""
-    peer.settimeout(timeout_s)
-    data = b""
+    data, give_up_s = b"", time.monotonic() + timeout_s
     try:
         while not data.endswith(b"\n") and len(data) < _LONGEST_LINE_BYTES:
+            peer.settimeout(max(give_up_s - time.monotonic(), 1e-3))  # 0 would mean: never wait
             part = peer.recv(1)
             if not part:
                 break

@@ -695,3 +695,25 @@ def test_the_name_of_a_line_is_that_of_its_device_whatever_leads_to_it(world: Gu
     found = os.stat(world.order.port)
     assert address == guard_address(world.order.port)
     assert address == b"\0jointctl-line-%x-%x" % (found.st_dev, found.st_rdev)
+
+
+def test_a_caller_that_drips_holds_the_guard_up_no_longer_than_one_that_says_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The guard sees no death in the meantime."""
+    clock = SimpleNamespace(s=0.0)
+    monkeypatch.setattr(elmo_guard, "time", SimpleNamespace(monotonic=lambda: clock.s))
+
+    class Dripping:
+        def settimeout(self, seconds: float) -> None:
+            self.seconds = seconds
+
+        def recv(self, _: int) -> bytes:
+            if self.seconds < 0.1:
+                raise TimeoutError
+            clock.s += 0.1
+            return b"x"
+
+    dripping: Any = Dripping()
+    assert elmo_guard.received_line(dripping, 0.5) is None
+    assert clock.s <= 0.6

@@ -117,6 +117,8 @@ class TestCommissioning:
             (saying(b"TC\r1.5;", b"TC"), DeviceError, "TC (=1.5) of the drive must be 0"),
             (saying(b"RM\r1;", b"RM"), DeviceError, "RM (=0) does not read back"),
             (saying(b"PX\rtwo;", b"PX"), DeviceError, "is not a number"),
+            (saying(b"PX\rnan;", b"PX"), DeviceError, "PX (='nan') of the drive is not a number"),
+            (saying(b"MO\r1e999;", b"MO"), DeviceError, "is not a number"),
         ],
     )
     def test_drives_that_answer_wrongly(
@@ -140,6 +142,16 @@ class TestCommissioning:
         port.character_s *= slower
         with pytest.raises(DeviceError, match="one exchange takes") if refused else nullcontext():
             port.drive(rate_Hz=150.0).commission()
+
+    @pytest.mark.parametrize("noise", [b"nan", b"inf", b"1e999"])
+    def test_noise_in_the_confirmation_is_not_raised_at_the_end(self, port: MemoryPort, noise: bytes) -> None:
+        """`make_safe` never raises: what is closed and reported after it would be left out."""
+        drive = port.drive()
+        drive.commission()
+        port.answer = saying(b"MO\r" + noise + b";", b"MO")
+        state = drive.make_safe()
+        assert state.startswith("unknown: MO (=")
+        assert "use the emergency stop" in state
 
 
 class TestBudget:
