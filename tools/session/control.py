@@ -27,6 +27,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STOP_COMMAND = "jointctl stop"
 AGAIN_S = 0.05
 STOOD_S = 30.0  # between two looks after a yes: this program was stopped (Ctrl-Z), or the computer slept
+LOOK_S = 1.0  # how often it is looked, whatever is computed between two motions
 _ESCALATION = (StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF)
 
 
@@ -44,7 +45,8 @@ class StopSignals:
         self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
         self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
         self._again = False  # the next signal is no new one
-        self.looked_ns: int | None = None  # by `now_ns`; from the user's yes until the loop is let go
+        self.looked_ns: int | None = None  # by `now_ns`; from the user's yes on, which may be for several motions
+        self.stood_s = 0.0  # since then, if it was long
         self._command = threading.Lock()
 
     @property
@@ -96,16 +98,27 @@ class StopSignals:
             raise KeyboardInterrupt
         self.look()
 
+    def agreed(self) -> None:
+        """The user has said yes."""
+        self.looked_ns = self.looked_ns or now_ns()
+
     def look(self) -> None:
         """`MotionFault` where a yes is out of date: who goes on after a standstill moves when no one expects it."""
+        self.note_standstill()
+        if self.stood_s:
+            raise MotionFault(
+                f"this program or the computer stood still for {self.stood_s:.0f} s after the motion was agreed to",
+                "nothing moves: start again",
+            )
+
+    def note_standstill(self) -> None:
+        """In any thread."""
         if self.looked_ns is None:
             return
-        before_ns, self.looked_ns = self.looked_ns, now_ns()
-        if (stood_s := (self.looked_ns - before_ns) * 1e-9) > STOOD_S:
-            raise MotionFault(
-                f"this program or the computer stood still for {stood_s:.0f} s after the motion was agreed to",
-                "nothing has moved: start again",
-            )
+        looked_ns = now_ns()
+        if (stood_s := (looked_ns - self.looked_ns) * 1e-9) > STOOD_S:
+            self.stood_s = stood_s
+        self.looked_ns = looked_ns
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -196,8 +209,28 @@ def stop_within_s(config: Config) -> float:
 def in_control(config: Config, output: Output, others: Sequence[Config] = ()) -> Iterator[Control]:
     """`BusError` names the program that has the bus; `others`: joints of an arm besides."""
     joints = (config, *others)
-    with stop_signals(raising=True) as signals, _locked(_places(joints), output, _within_s(joints), signals) as control:
+    with (
+        stop_signals(raising=True) as signals,
+        _locked(_places(joints), output, _within_s(joints), signals) as control,
+        _looked_on(signals),
+    ):
         yield control
+
+
+@contextmanager
+def _looked_on(signals: StopSignals) -> Iterator[None]:
+    """A command of several motions computes for minutes between two of them: that is no standstill."""
+    ended = threading.Event()
+
+    def look_on() -> None:
+        while not ended.wait(LOOK_S):
+            signals.note_standstill()
+
+    threading.Thread(target=look_on, name="standstill", daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
 
 
 @contextmanager

@@ -25,7 +25,6 @@ from jointctl.drivers.errors import (
     NoDeviceError,
     refused_by_system,
 )
-from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.child_process import OwnVirtualJoint
@@ -108,7 +107,6 @@ class Session:
 
     def _run(self) -> RunResult | None:
         config, signals = self._config, self.signals
-        signals.looked_ns = None
         self._kind.check_rate(config)
         with (
             signals.held(),
@@ -132,7 +130,7 @@ class Session:
                 placed = self._ask(lambda: self._allowed(reports))
                 if placed is None:
                     return None
-                signals.looked_ns = now_ns()
+                signals.agreed()
                 loop.wait_ready(signals.leave_if_asked, self._output.note)
                 signals.leave_if_asked()
                 if guard is not None:

@@ -79,6 +79,8 @@ def tune(
             consent.show(job.envelope())
             if not (dry_run or consent.agreed(())):
                 return never_begun("", output)
+            if carrier.control is not None:
+                carrier.control.signals.agreed()
             return job.run()
         except NotCarriedOut as ended:
             if not ended.stopped_by:

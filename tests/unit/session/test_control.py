@@ -42,6 +42,8 @@ from jointctl.tools.session.control import (
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.session import NOTED_WITHIN_NS, Session, came_before
 from jointctl.tools.verbs.start import Interruption
+from tests.configurations import written
+from tests.python_process import eventually
 
 
 def test_what_has_ended_a_run_is_told_where_its_log_takes_nothing_more() -> None:
@@ -101,6 +103,35 @@ def test_after_a_yes_a_standstill_is_a_reason_to_leave(
     signals.leave_if_asked()
     with pytest.raises(MotionFault, match="stood still for 31 s") if refused else nullcontext():
         signals.leave_if_asked()
+
+
+@pytest.mark.parametrize(("stood_s", "refused"), [(31, True), (29, False)])
+def test_one_yes_for_several_motions_is_out_of_date_after_a_standstill_between_two(
+    monkeypatch: pytest.MonkeyPatch, stood_s: int, refused: bool
+) -> None:
+    """Minutes of computing between two motions are none: a thread looks on."""
+    signals, clock = StopSignals(), SimpleNamespace(s=1000)
+    monkeypatch.setattr(control, "now_ns", lambda: clock.s * 10**9)
+    signals.agreed()
+    for _ in range(300):
+        clock.s += 1
+        signals.note_standstill()
+    signals.leave_if_asked()
+    clock.s += stood_s
+    signals.note_standstill()  # before the next motion asks
+    signals.agreed()  # which is the same yes
+    with pytest.raises(MotionFault, match="stood still for 31 s") if refused else nullcontext():
+        signals.leave_if_asked()
+
+
+def test_a_command_is_looked_on_between_its_motions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(control, "LOOK_S", 1e-3)
+    config = load_config(written(tmp_path / "joint.toml", bus__channel="nobodys"))
+    with in_control(config, Output(quiet=True)) as held:
+        assert held.signals.looked_ns is None
+        held.signals.agreed()
+        before_ns = held.signals.looked_ns
+        eventually(lambda: held.signals.looked_ns != before_ns)
 
 
 def test_the_first_signal_is_the_one_that_is_named() -> None:
