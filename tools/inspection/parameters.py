@@ -32,6 +32,7 @@ COMMANDS = frozenset(
      0x60FE, 0x60FF)
 )  # fmt: skip
 _HISTORY = 0x1003
+AXES, OF_AXIS = 8, 0x800  # a device has so many axes at most, so far apart are their objects (CiA 301, from 6000 on)
 
 
 @dataclass
@@ -63,7 +64,10 @@ def is_parameter(variable: ODVariable) -> bool:
     """Whether restoring may write the object."""
     counts = variable.subindex == 0 and variable.parent is not None and hasattr(variable.parent, "subindices")
     mapping = 0x1600 <= variable.index < 0x1800 or 0x1A00 <= variable.index < 0x1C00
-    return bool(variable.writable and variable.readable and variable.index not in COMMANDS and (mapping or not counts))
+    index = variable.index
+    if 0x6000 <= index < 0x6000 + AXES * OF_AXIS:  # the same of each axis
+        index = 0x6000 + (index - 0x6000) % OF_AXIS
+    return bool(variable.writable and variable.readable and index not in COMMANDS and (mapping or not counts))
 
 
 def variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:

@@ -158,15 +158,19 @@ def restore_file(
 
 
 def _require_off(reader: SdoReader) -> None:
+    """All axes of the device: it leaves operational as a whole."""
     from jointctl.drivers.canopen.cia import State, state_of_word, state_text
+    from jointctl.tools.inspection.parameters import AXES, OF_AXIS
 
     under_power = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
-    word = reader.value(0x6041)
-    if word is not None and state_of_word(word) in under_power:
-        raise DeviceError(
-            f"node {reader.node} is in {state_text(word)}: nothing is written into a drive under power",
-            "jointctl stop CONFIG",
-        )
+    for place in range(0x6041, 0x6041 + AXES * OF_AXIS, OF_AXIS):
+        word = reader.value(place) if reader.objects.variable(place, 0) is not None else None
+        if word is not None and state_of_word(word) in under_power:
+            axis = f", axis {(place - 0x6041) // OF_AXIS + 1}," if place != 0x6041 else ""
+            raise DeviceError(
+                f"node {reader.node}{axis} is in {state_text(word)}: nothing is written into a drive under power",
+                "jointctl stop CONFIG",
+            )
 
 
 def _require_same_device(reader: SdoReader, wanted: ParameterSet, path: Path, other_device: bool) -> None:

@@ -7,7 +7,9 @@ import json
 import re
 import struct
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -32,7 +34,7 @@ from jointctl.tools.inspection.parameters import (
     variables,
 )
 from jointctl.tools.inspection.subject import ATTEMPTS, SdoReader, Subject, canopen_network, new_dictionary
-from jointctl.tools.verbs.params import DIFFERENT, diff, dump, place_index, restore_file
+from jointctl.tools.verbs.params import DIFFERENT, _require_off, diff, dump, place_index, restore_file
 from tests.sessions import Terminal, output
 
 # --- Subject and output of the verb params, and a DCF that is changed ---
@@ -261,6 +263,34 @@ def test_what_moves_or_acts_is_no_parameter() -> None:
     chosen = {v.index for v in variables(read_dictionary(EDS, 1)) if is_parameter(v)}
     assert {0x6072, 0x605A, 0x1017, 0x1016, 0x1A00, 0x1800} <= chosen
     assert not chosen & COMMANDS
+
+
+@pytest.mark.parametrize(
+    ("index", "parameter"),
+    [
+        (0x6840, False),
+        (0x687A, False),
+        (0x70FF, False),
+        (0x9840, False),
+        (0x6872, True),
+        (0x685A, True),
+        (0xA040, True),
+    ],
+)
+def test_nor_is_what_moves_another_axis_of_the_device(index: int, parameter: bool) -> None:
+    variable: Any = ODVariable("of an axis", index, 0)
+    variable.access_type = "rw"
+    assert is_parameter(variable) is parameter
+
+
+@pytest.mark.parametrize(("axis", "word", "refused"), [(2, 0x0237, True), (8, 0x0217, True), (2, 0x0233, False)])
+def test_a_device_is_left_alone_while_any_of_its_axes_is_under_power(axis: int, word: int, refused: bool) -> None:
+    words = {0x6041: 0x0250, 0x6041 + (axis - 1) * 0x800: word}
+    reader: Any = SimpleNamespace(
+        node=1, value=words.__getitem__, objects=SimpleNamespace(variable=lambda index, _: words.get(index))
+    )
+    with pytest.raises(DeviceError, match=rf"node 1, axis {axis}, is in") if refused else nullcontext():
+        _require_off(reader)
 
 
 # --- params restore on the virtual drive of this process: read back, refused, or nothing written at all ---
