@@ -418,19 +418,19 @@ class Dialogue:
             self.interpreter.feed(data, self._clock())
         self._port.discard()
 
-    def once(self, command: bytes) -> Reply:
-        """Send and wait for the end of the command, whatever it is."""
+    def once(self, command: bytes, behind: bytes = b"") -> Reply:
+        """Send and wait for the end of the command, whatever it is; what is `behind` it follows unheard."""
         self._port.discard()
         now_s = self._clock()
         until_s = now_s + self._timeout_s
-        self._port.write(self.interpreter.begin(command, now_s, self._timeout_s))
+        self._port.write(self.interpreter.begin(command, now_s, self._timeout_s) + behind)
         while True:
             data = self._port.read(max(0.0, until_s - self._clock()))
             reply = self.interpreter.feed(data, self._clock()) if data else self.interpreter.poll(self._clock())
             if reply is not None:
                 return reply
 
-    def ask(self, command: bytes, attempts: int = ATTEMPTS) -> str:
+    def ask(self, command: bytes, attempts: int = ATTEMPTS, behind: bytes = b"") -> str:
         """The value.  `RefusedError` if the drive says no, `BusError` for garbage, `NoDeviceError` for silence."""
         shown = command.decode("ascii").strip()
         reply = Reply(ReplyKind.TIMEOUT)
@@ -438,7 +438,7 @@ class Dialogue:
             self.gate()
             if attempt:
                 self.resynchronise()
-            reply = self.once(command)
+            reply = self.once(command, behind)
             if reply.kind is ReplyKind.VALUE:
                 return reply.text
             if reply.kind is ReplyKind.ERROR:

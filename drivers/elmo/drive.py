@@ -426,7 +426,7 @@ class ElmoDrive:
     def clear_fault(self) -> str:
         """See `Drive.clear_fault`.  MF and the latch in SR are cleared by MO=1 alone: in torque mode, with TC at zero.
 
-        So the motor is on for the time of one exchange, without torque, and is switched off again.  Before that UM=1,
+        So the motor is on for a moment, without torque, and is switched off again.  Before that UM=1,
         RM=0 and TC=0 have been read back: without that confirmation MO=1 is not said.
         """
         line = self._line
@@ -440,10 +440,11 @@ class ElmoDrive:
         if status & AMPLIFIER_MASK:
             raise DeviceError(f"the fault cannot be cleared while its cause remains: {cause}")
         set_torque_mode(line)
-        try:
-            line.assign("MO", 1, attempts=1)
+        off = b"TC=0\rMO=0\r"
+        try:  # in one go: the drive has all of it although this program dies meanwhile
+            line.ask(encode("MO", value=1), 1, behind=off)
         finally:
-            self._byte_port.write(b"\rTC=0\rMO=0\r")
+            self._byte_port.write(b"\r" + off)
             line.resynchronise()
         self._motor_off()
         status, fault = line.integer("SR"), line.integer("MF")

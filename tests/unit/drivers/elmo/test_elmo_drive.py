@@ -337,7 +337,21 @@ class TestClearFault:
         before = port.commands[: port.commands.index(b"MO=1")]
         assert before[-5:] == [b"UM=1", b"UM", b"RM=0", b"RM", b"TC"]
         after = port.commands[len(before) + 1 :]
-        assert after[:4] == [b"", b"TC=0", b"MO=0", b""]
+        assert after[:5] == [b"TC=0", b"MO=0", b"", b"TC=0", b"MO=0"]
+
+    def test_a_program_that_dies_behind_that_command_leaves_the_motor_off(self, port: MemoryPort) -> None:
+        """Nothing else would switch it off: a serial drive does not notice, and its brake would stay open."""
+
+        def dies(line: bytes, reply: bytes) -> bytes:
+            if line == b"MO=1":
+                port.failure = BusError("killed")  # nothing more is said
+            return reply
+
+        port.device.m.motor_fault, port.answer = 0x200000, dies
+        with pytest.raises(BusError, match="killed"):
+            port.drive().clear_fault()
+        assert b"MO=1" in port.commands
+        assert port.device.m.motor_on == 0
 
     @pytest.mark.parametrize(
         ("spoilt", "reply", "words"),
