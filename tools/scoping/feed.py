@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from jointctl.drivers.errors import DataError, UsageError, printable
+from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.recording.ros_messages import JOINT_NAMES, StateCycles
@@ -79,13 +80,18 @@ def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
     return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)
 
 
+def now_s() -> float:
+    """By the clock that no standby stops: what was said before one is old afterwards."""
+    return now_ns() * 1e-9
+
+
 def in_time(request: ViewerRequest) -> bool:
     """Whether who asks had a word of this program no longer than LATE_S ago: its `told_s`, which comes back with it.
 
-    What was held up on its way, or by a server or a program that stood still, comes when nobody expects it.
+    What was held up on its way, or by a server, a program or a computer that stood still, comes when nobody expects it.
     """
     told_s = request.values.get("told_s")
-    return isinstance(told_s, float) and 0.0 <= time.monotonic() - told_s <= LATE_S
+    return isinstance(told_s, float) and 0.0 <= now_s() - told_s <= LATE_S
 
 
 def require_free(what: str, host: str, port: int, hint: str) -> None:

@@ -27,7 +27,7 @@ from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
-from jointctl.tools.scoping.feed import ScopeFeed, in_time, require_free, server_process
+from jointctl.tools.scoping.feed import ScopeFeed, in_time, now_s, require_free, server_process
 from jointctl.tools.scoping.remote_options import (
     LISTEN_AT,
     ObserveOptions,
@@ -130,8 +130,8 @@ class EnabledFromElsewhere:
         # a STOP that came before the approval still counts, an enable does not: it has not this number
         feed, number = self._feed, secrets.randbelow(1 << 48)
         self._output.note(f"approved; waiting up to {APPROVED_S:g} s for ~/enable, Ctrl-C ends it")
-        told_s, give_up_s = -TELL_AGAIN_S, time.monotonic() + APPROVED_S
-        while feed.stop_request() is StopRequest.NONE and time.monotonic() < give_up_s:
+        told_s, give_up_s = -TELL_AGAIN_S, now_s() + APPROVED_S
+        while feed.stop_request() is StopRequest.NONE and now_s() < give_up_s:
             for request in feed.requests():
                 if request.kind == "enable" and request.values.get("number") == number:
                     if not in_time(request):
@@ -142,8 +142,8 @@ class EnabledFromElsewhere:
                     return True
             if feed.gone:
                 raise JointctlError("the ROS 2 server has ended: nothing can enable the joint", "what it said is above")
-            if time.monotonic() - told_s > TELL_AGAIN_S:
-                told_s = time.monotonic()
+            if now_s() - told_s > TELL_AGAIN_S:
+                told_s = now_s()
                 feed.settings({"stage": "approved", "number": number, "told_s": told_s})
             time.sleep(POLL_S)
         feed.settings({"stage": "declined"})

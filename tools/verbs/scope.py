@@ -200,11 +200,11 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
     import secrets
 
     from jointctl.firmware_py.states import StopRequest
-    from jointctl.tools.scoping.feed import in_time
+    from jointctl.tools.scoping.feed import in_time, now_s
 
     number = secrets.randbelow(1 << 48)
-    told_s, give_up_s, late = 0.0, time.monotonic() + patience_s, ""
-    while feed.stop_request() is StopRequest.NONE and time.monotonic() < give_up_s:
+    told_s, give_up_s, late = 0.0, now_s() + patience_s, ""
+    while feed.stop_request() is StopRequest.NONE and now_s() < give_up_s:
         for request in feed.requests():
             given = request.values.get("number"), request.values.get("clear")
             if request.kind == "start" and given == (number, True):
@@ -212,8 +212,8 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
                     return True
                 late, told_s = START_LATE, 0.0
         _require_server(feed)
-        if time.monotonic() - told_s > TELL_AGAIN_S:
-            told_s = time.monotonic()
+        if now_s() - told_s > TELL_AGAIN_S:
+            told_s = now_s()
             feed.settings({"stage": "ready", "number": number, "lines": lines, "told_s": told_s, "late": late})
         time.sleep(POLL_S)
     return False

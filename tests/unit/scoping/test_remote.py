@@ -24,8 +24,8 @@ from jointctl.program import observers
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.recording.run_log import INFO, WARNING
-from jointctl.tools.scoping import remote
-from jointctl.tools.scoping.feed import LATE_S, ScopeFeed
+from jointctl.tools.scoping import feed, remote
+from jointctl.tools.scoping.feed import LATE_S, ScopeFeed, now_s
 from jointctl.tools.scoping.foxglove_server import FoxgloveView, set_point_of
 from jointctl.tools.scoping.remote import EnabledFromElsewhere, joint_name
 from jointctl.tools.scoping.remote_options import RemoteOptions, check_remote, foxglove_place, with_values
@@ -150,9 +150,29 @@ def test_an_enable_that_was_held_up_is_not_taken(ends: Any, monkeypatch: pytest.
     """It knows the number, but its server had no word of this program for long when it came."""
 
     def late(told: Any) -> ViewerRequest:
-        return ViewerRequest("enable", "a node", {**told, "told_s": time.monotonic() - LATE_S - 0.1})
+        return ViewerRequest("enable", "a node", {**told, "told_s": now_s() - LATE_S - 0.1})
 
     assert consent_of(ends, late, monkeypatch).agreed([]) is False
+
+
+@pytest.mark.parametrize(("slept_s", "taken"), [(299.0, True), (301.0, False)])
+def test_an_approval_does_not_outlive_a_standby(
+    ends: Any, slept_s: float, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other clock stands still in the meantime, and a program may ask for the enable again and again."""
+    clock = SimpleNamespace(s=1000.0)
+
+    def wakes(told: Any) -> ViewerRequest | None:
+        if clock.s < 1001.0:
+            clock.s += slept_s
+            return None
+        return enable(told)
+
+    consent = consent_of(ends, wakes, monkeypatch)
+    monkeypatch.setattr(remote, "APPROVED_S", 300.0)
+    for module in (remote, feed):
+        monkeypatch.setattr(module, "now_s", lambda: clock.s)
+    assert consent.agreed([]) is taken
 
 
 @pytest.mark.parametrize("values", [{}, {"number": None}, {"number": 1}, {"number": "x"}])
