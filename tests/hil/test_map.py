@@ -148,8 +148,19 @@ def test_the_faults_of_the_virtual_joint_end_a_map_in_simulated_time(tmp_path: P
     faulty = load_config(
         written(tmp_path / "faulty.toml", "realistic", virtual__faults=[{"kind": "drive_fault", "at_s": 3.0}])
     )
-    with pytest.raises(MotionFault, match="no map"):
+    with pytest.raises(MotionFault, match=r"DRIVE_FAULT \(\d+\): the drive reported a fault .*; no map") as fault:
         map_verb(faulty, Output(stdout=io.StringIO(), stderr=io.StringIO()), options=IN_LOCKSTEP)
+    assert "likely cause: " in (fault.value.hint or "")
+
+
+@pytest.mark.parametrize(("start_rad", "outside"), [(0.71, True), (-0.71, True), (0.69, False)])
+def test_a_dry_run_says_that_the_joint_stands_outside_its_limits(
+    tmp_path: Path, start_rad: float, outside: bool
+) -> None:
+    joint = load_config(written(tmp_path / "joint.toml", "realistic", virtual__initial_position_rad=start_rad))
+    err = io.StringIO()
+    assert map_verb(joint, Output(stdout=io.StringIO(), stderr=err), options=IN_LOCKSTEP, dry_run=True) == 0
+    assert ("outside limits.position_*: not enabled there" in err.getvalue()) is outside
 
 
 def test_small_ripple_is_shown_with_the_digits_of_its_interval() -> None:

@@ -38,6 +38,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.study import study, with_plants
 from tests.configurations import shipped
 from tests.page_figures import foreign_colours, svgs
+from tests.places import CONFIGS
 
 
 @pytest.fixture
@@ -135,6 +136,19 @@ def test_an_interruption_keeps_what_is_done_and_ends_the_other_processes_too(
     result = run_study(base, named(("paper",)), settings, workers=Workers(workers), progress=interrupt)
     assert result.interrupted
     assert least <= len(result.plants) <= most
+
+
+def test_a_file_whose_drive_closes_its_loops_brings_them_along(tmp_path: Path) -> None:
+    alone = tmp_path / "alone.toml"
+    alone.write_text((CONFIGS / "csp.toml").read_text().replace("_offset = true", "_offset = false"))
+    found = run_study(shipped("csp", trajectory__duration_s=3.0), named(("csp", str(alone))),
+                      StudySettings(plants=2, seed=1, after_s=2.0))  # fmt: skip
+    assert np.min(found.values("alone", "rmse_mrad")) > 10.0 * np.max(found.values("csp", "rmse_mrad"))
+
+
+def test_a_file_whose_drive_closes_its_loops_is_not_taken_for_a_law_on_torque(base: Config) -> None:
+    with pytest.raises(ConfigurationError, match="controller csp needs a --base"):
+        run_study(base, named(("csp",)), StudySettings(plants=1, after_s=1.0))
 
 
 def test_a_time_after_the_end_is_refused(base: Config) -> None:

@@ -7,7 +7,7 @@ believes about the friction is the base configuration's [friction], or that of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def named(names: tuple[str, ...] = DEFAULT) -> list[Controller]:
 
 
 def from_file(name: str) -> Controller:
-    """The law of a configuration file, with what that file believes about the friction."""
+    """The law of a configuration file, with what that file believes about the friction, and its drive's own loops."""
     path = Path(name)
     if not path.exists() and shipped_config(name).exists():
         path = shipped_config(name)
@@ -105,7 +105,8 @@ def from_file(name: str) -> Controller:
         raise ConfigurationError(f"controller (={name}) must be a configuration file or one of {known}")
     config = load_config(path)
     require_simulated(config, "study")
-    return Controller(path.stem, config.control, config.friction)
+    cascade = canopen_section(config).cascade
+    return Controller(path.stem, config.control, config.friction, {} if cascade is None else cascade.model_dump())
 
 
 def controller_config(base: Config, controller: Controller) -> Config:
@@ -116,7 +117,10 @@ def controller_config(base: Config, controller: Controller) -> Config:
     drive = base.drive
     if controller.cascade:
         if drive.own_loop() is CommandKind.TORQUE:
-            raise ConfigurationError(f"controller {controller.name} needs a --base with drive.mode csp or csv")
+            raise ConfigurationError(
+                f"controller {controller.name} needs a --base with drive.mode csp or csv",
+                "such as that controller's own file",
+            )
         cascade = canopen_section(base).cascade
         assert cascade is not None
         update["drive"] = drive.model_copy(update={"cascade": cascade.model_copy(update=dict(controller.cascade))})
@@ -131,7 +135,7 @@ def with_chosen_gains(base: Config, controller: Controller) -> Controller:
     """The law with gains for what is believed of the base joint, and learning that converges on it."""
     config = controller_config(base, controller)
     control = gains_of_file(config, loop_settings(config)[0]).control
-    return Controller(controller.name, control, controller.friction)
+    return replace(controller, control=control)
 
 
 def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:

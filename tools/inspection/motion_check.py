@@ -197,7 +197,7 @@ class CheckMotion:
     def _envelope(self, report: CommissioningReport) -> list[str]:
         plan, start = self.plan, report.start_position_rad
         return [
-            *joint_lines(report),
+            *joint_lines(report, self.config.limits),
             f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
             f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
             f"limits     {text_Nm(plan.torque_Nm)}, {plan.velocity_radps:.2f} rad/s; it is braked beyond "

@@ -7,7 +7,7 @@ and those of several beside each other.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -465,6 +465,17 @@ def _configuration(log: RunLog) -> dict[str, Any]:
         return {}
 
 
+def _law(settings: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Which one, its gains and its friction; a drive that closes its own loops has its own gains."""
+    control, cascade = settings.get("control", {}), settings.get("drive", {}).get("cascade")
+    kind, friction = str(control.get("kind", "")), str(control.get("feed_forward", ""))
+    if cascade is None:
+        return kind, f"{control['kp']}, {control['kv']}" if "kp" in control and "kv" in control else "", friction
+    if cascade.get("torque_offset", True):
+        return f"the drive's, {kind} fed forward", "", friction
+    return "the drive's alone", "", "none"
+
+
 def what_ran(names: Sequence[str], logs: Sequence[RunLog]) -> Table:
     """One column a log."""
     rows: list[list[object]] = []
@@ -485,15 +496,9 @@ def what_ran(names: Sequence[str], logs: Sequence[RunLog]) -> Table:
     add("drive", [" ".join(filter(None, (d.get("name"), d.get("product")))) for d in drives])
     add("serial number", [d.get("serial", "") for d in drives])
     add("mode", [d.get("mode", "") for d in drives])
-    add("controller", setting("control", "kind"))
-    add(
-        "kp [1/s²], kv [1/s]",
-        [
-            f"{a}, {b}" if a or b else ""
-            for a, b in zip(setting("control", "kp"), setting("control", "kv"), strict=True)
-        ],
-    )
-    add("friction feed-forward", setting("control", "feed_forward"))
+    laws = [_law(found) for found in settings]
+    for at, name in enumerate(("controller", "kp [1/s²], kv [1/s]", "friction feed-forward")):
+        add(name, [law[at] for law in laws])
     add("trajectory", setting("trajectory", "kind"))
     add("rate [Hz]", setting("loop", "rate_Hz"))
     add("friction model, SHA-256", [log.metadata.get("friction", {}).get("sha256", "")[:16] for log in logs])

@@ -183,13 +183,14 @@ def blamed(name: str) -> Iterator[None]:
         raise
 
 
-def joint_lines(report: CommissioningReport) -> list[str]:
+def joint_lines(report: CommissioningReport, limits: Limits) -> list[str]:
     """Of every envelope: which drive it is, and where the joint stands."""
-    identity = report.identity
+    identity, start_rad = report.identity, report.start_position_rad
+    inside = limits.position_min_rad <= start_rad <= limits.position_max_rad
     return [
         f"drive      {identity.name or 'unnamed'}, vendor {identity.vendor}, serial {identity.serial or 'unknown'}, "
         f"{report.mode}",
-        f"now at     {report.start_position_rad:+.4f} rad",
+        f"now at     {start_rad:+.4f} rad{'' if inside else ', outside limits.position_*: not enabled there'}",
     ]
 
 
@@ -296,7 +297,7 @@ class FreeMotion:
         if axis.stream.client_timeout_ns:
             what = f"as the program says; it may be silent for {axis.stream.client_timeout_ns * 1e-9:g} s"
         return [
-            *joint_lines(report),
+            *joint_lines(report, self._config.limits),
             f"motion     from {self.start_rad:+.4f} rad, {what}",
             limits_line(self._config.limits),
             *remark_lines(report.remarks),
@@ -347,7 +348,7 @@ class ConfiguredMotion:
         rounding_s = float(axis.trajectory.rounding_s)
         jerk = f", {acceleration / rounding_s:.3g} rad/s3" if rounding_s else ""
         return [
-            *joint_lines(report),
+            *joint_lines(report, config.limits),
             f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
             if approach
             else f"approach   none: at once to {first.position_rad:+.4f} rad",

@@ -25,11 +25,12 @@ from jointctl.hil.lockstep import TRUE_WARMTH_degC
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
-from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.display import OnlyShows, Snapshot, run_display
+from jointctl.tools.session.fault_words import FaultText, fault_text
 from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
 from jointctl.tools.session.session import Session
@@ -375,7 +376,7 @@ class SweepPass:
         load_Nm = self.points[0].condition.load_Nm
         own += [f"a load of {load_Nm:g} Nm at the joint is subtracted; the drive must hold it"] if load_Nm else []
         return [
-            *joint_lines(report),
+            *joint_lines(report, limits),
             f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
             f"sweep      {len(self.points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, "
             "both directions together",
@@ -442,8 +443,7 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
         return never_begun(session.drive_state, output, dry_run=dry_run)
     require_off(session.drive_state)
     if result.fault_text is not None:
-        text = result.fault_text
-        raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no {what}", text.advice)
+        raise _ended(result.fault, result.fault_text, what)
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; no {what}")
         return INTERRUPTED
@@ -452,15 +452,16 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
     return result
 
 
+def _ended(fault: Fault, text: FaultText, what: str) -> MotionFault:
+    return MotionFault(f"{fault.name} ({int(fault)}): {text.happened}; no {what}", text.advice)
+
+
 def lockstep_log(config: Config, motion: Motion, consent: Consent, *, allow_low_margin: bool = False) -> Path | None:
     """A run log of the motion on the virtual joint in simulated time; None after a dry run."""
-    begun = simulated(config, motion, consent, allow_low_margin=allow_low_margin)
-    if begun is None:
+    done = simulated_run(config, motion, consent, "log", allow_low_margin=allow_low_margin)
+    if done is None:
         return None
-    joint, placed = begun
-    run = joint.run_as_configured(placed.constants, placed.table)
-    if run.fault:
-        raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no log")
+    joint, run = done
     path = log_path(config)
     with RunLogWriter(path, run_metadata(config, joint.report)) as log:
         log.write_records(run.log)
@@ -468,6 +469,22 @@ def lockstep_log(config: Config, motion: Motion, consent: Consent, *, allow_low_
             for at in range(0, len(run.log), round(config.loop.rate_Hz)):
                 log.write_temperature(int(run.log.time_ns[at]), float(run.truth[at, TRUE_WARMTH_degC]))
     return path
+
+
+def simulated_run(
+    config: Config, motion: Motion, consent: Consent, what: str, *, allow_low_margin: bool
+) -> tuple[LockstepJoint, LockstepRun] | None:
+    """See `simulated`, carried out; `what` it is for ("map"); `MotionFault` where a fault has ended it."""
+    begun = simulated(config, motion, consent, allow_low_margin=allow_low_margin)
+    if begun is None:
+        return None
+    joint, placed = begun
+    run = joint.run_as_configured(placed.constants, placed.table)
+    if run.fault:
+        two_encoders = config.joint_encoder is not None
+        text = fault_text(run.fault, float(run.state.fault_value), 0, two_encoders=two_encoders)
+        raise _ended(run.fault, text, what)
+    return joint, run
 
 
 def simulated(

@@ -269,7 +269,7 @@ class ExcitePass:
     def _envelope(self, approach_s: float, motion: SweepMotion, report: CommissioningReport) -> list[str]:
         design, found = self.design, self.design.samples
         return [
-            *joint_lines(report),
+            *joint_lines(report, self.config.limits),
             f"approach   to {motion.table[0, 1]:+.4f} rad in {approach_s:.1f} s",
             f"motion     {motion.low_rad:+.3f} .. {motion.high_rad:+.3f} rad, {design.slowest_radps:.3g} to "
             f"{np.max(np.abs(found.velocity_radps)):.3g} rad/s, up to {np.max(np.abs(found.acceleration_radps2)):.3g} "

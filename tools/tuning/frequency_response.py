@@ -297,7 +297,7 @@ class ResponseMotion:
         duration_s = len(plan.legs.velocity_radps) / config.loop.rate_Hz
         frequency, control = plan.sine.frequency_Hz, config.control
         return [
-            *joint_lines(report),
+            *joint_lines(report, config.limits),
             f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
             f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
             f"{top:.2f} rad/s, {duration_s:.0f} s",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, decimals_of
+from jointctl.drivers.errors import ConfigurationError, UsageError, decimals_of
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
@@ -191,18 +191,14 @@ def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] 
 
 def _lockstep(config: Config, output: Output, *, allow_low_margin: bool, **how: bool) -> tuple[Any, float] | int:
     from jointctl.tools.session.plan import TerminalConsent, configured
-    from jointctl.tools.sweeping.carry_out import simulated
+    from jointctl.tools.sweeping.carry_out import simulated_run
 
     consent = TerminalConsent(output, **how)
-    begun = simulated(config, configured(config), consent, allow_low_margin=allow_low_margin)
-    if begun is None:
+    done = simulated_run(config, configured(config), consent, "map", allow_low_margin=allow_low_margin)
+    if done is None:
         output.note("dry run: nothing moved")
         return 0
-    joint, placed = begun
-    run = joint.run_as_configured(placed.constants, placed.table)
-    if run.fault:
-        raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no map")
-    return run.log, _late_s(config)
+    return done[1].log, _late_s(config)
 
 
 def _late_s(config: Config) -> float:

@@ -25,7 +25,7 @@ from jointctl.tools.experiments.controller_study import PlantResult, StudyResult
 from jointctl.tools.experiments.judge import Verdict
 from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output
-from jointctl.tools.recording.report_figures import aligned, at_times, binned, friction_points, run_figures
+from jointctl.tools.recording.report_figures import aligned, at_times, binned, friction_points, run_figures, what_ran
 from jointctl.tools.recording.report_page import (
     Details,
     Figure,
@@ -41,6 +41,7 @@ from jointctl.tools.recording.report_page import (
 )
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.recording.run_log import INFO, RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
 from tests.page_figures import foreign_colours, svgs
@@ -311,6 +312,24 @@ def test_names_and_configurations_are_text_whatever_they_hold(tmp_path: Path) ->
     check(html)
     assert "<script" not in html
     assert "&lt;script&gt;" in html
+
+
+@pytest.mark.parametrize(
+    ("drive", "controller"),
+    [
+        ("", ("pid", "3.5, 1.0", "measured")),
+        ("[drive.cascade]\ntorque_offset = true\n", ("the drive's, pid fed forward", None, "measured")),
+        ("[drive.cascade]\ntorque_offset = false\n", ("the drive's alone", None, "none")),
+    ],
+)
+def test_the_controller_of_a_drive_that_closes_its_loops_is_the_drives(
+    tmp_path: Path, drive: str, controller: tuple[str | None, ...]
+) -> None:
+    law = "[control]\nkind = 'pid'\nkp = 3.5\nkv = 1.0\nfeed_forward = 'measured'\n"
+    log = read_run_log(write_log(tmp_path / "run.mcap", run_records(), drive + law))
+    rows: dict[Any, Any] = dict(what_ran(["run"], [log]).rows)
+    names = ("controller", "kp [1/s²], kv [1/s]", "friction feed-forward")
+    assert tuple(rows.get(name) for name in names) == controller
 
 
 def test_a_fault_is_the_first_thing_said(tmp_path: Path) -> None:
