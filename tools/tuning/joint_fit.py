@@ -423,19 +423,20 @@ CRITICAL_SHARE = 0.04  # of the critical damping: what is more is hysteresis, wh
 def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
     """Inertia, delay, lag, and of a soft reducer its inertias, stiffness and damping."""
 
-    def found(section: str, key: str, one: Estimate, value: float | None = None) -> Found:
-        number = rounded(one.value if value is None else value)
+    def found(section: str, key: str, one: Estimate) -> Found:
+        number = rounded(max(one.value, 0.0))
         return Found((section,), key, number, f"{number:g} +- {one.half:.2g}, {source}")
 
     values = [
         found("joint", "inertia_kgm2", fit.inertia_kgm2),
-        found("margin", "loop_delay_s", fit.delay_s, max(fit.delay_s.value, 0.0)),
-        found("margin", "current_lag_s", fit.lag_s, max(fit.lag_s.value, 0.0)),
+        found("margin", "loop_delay_s", fit.delay_s),
+        found("margin", "current_lag_s", fit.lag_s),
     ]
     if not fit.flexible:
         return values
     joint = fit.joint()
-    values.append(found("reducer", "motor_inertia_kgm2", fit.link_kgm2, joint.motor_kgm2))
+    of_both = math.hypot(fit.inertia_kgm2.half, fit.link_kgm2.half)  # the motor's is the difference
+    values.append(found("reducer", "motor_inertia_kgm2", Estimate(joint.motor_kgm2, of_both)))
     if not fit.tells_link:
         remark = f"{joint.motor_kgm2:.3g}, a share that the encoder on the link does not tell"
         values[-1] = replace(values[-1], source=remark)
@@ -444,6 +445,9 @@ def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
         steady = rounded(fit.stiffness_Nmprad.value / SMALL_MOTION)
         remark = f"{steady:g}, loop_stiffness_Nmprad / {SMALL_MOTION:g}: not measured"
         values.append(Found(("reducer",), "stiffness_Nmprad", steady, remark))
-    damping = min(joint.damping_Nmspr, CRITICAL_SHARE * joint.critical_Nmspr)
-    values.append(found("reducer", "damping_Nmspr", fit.damping_Nmspr, damping))
+    values.append(found("reducer", "damping_Nmspr", fit.damping_Nmspr))
+    most = CRITICAL_SHARE * joint.critical_Nmspr
+    if joint.damping_Nmspr > most:
+        remark = f"{rounded(most):g}, {CRITICAL_SHARE * 100.0:g} % of the critical damping: more is hysteresis; found: "
+        values[-1] = replace(values[-1], value=rounded(most), source=remark + values[-1].source)
     return values

@@ -48,6 +48,20 @@ def fit_of(inertia: float, late_s: float, link: float = 0.0, stiffness: float = 
     return JointFit(link > 0.0, estimates, 1e-3, 0.03, 80, 50.0)
 
 
+@pytest.mark.parametrize(("damping_Nmspr", "hysteresis"), [(2.5, False), (30.0, True)])
+def test_the_file_says_how_well_the_motors_inertia_and_the_damping_are_known(
+    damping_Nmspr: float, hysteresis: bool
+) -> None:
+    fit = fit_of(2.0, 1.5e-3, 1.2, 1.6e4)
+    fit = replace(fit, values={**fit.values, "damping_Nmspr": Estimate(damping_Nmspr, 0.1)})
+    found = {one.key: one for one in values_of_fit(shipped("realistic"), fit, "test")}
+    assert found["motor_inertia_kgm2"].source == "0.8 +- 0.047, test"  # of total and link, 0.04 and 0.024
+    damping = found["damping_Nmspr"]
+    assert damping.source.endswith(f"{damping_Nmspr:g} +- 0.1, test")
+    assert ("4 % of the critical damping" in damping.source) is hysteresis
+    assert (damping.value < damping_Nmspr) is hysteresis
+
+
 def known(config: Config, fit: JointFit) -> Config:
     return with_values(config, values_of_fit(config, fit, "test"))
 
