@@ -55,7 +55,7 @@ class Joint(Program):
     `foxglove` (True, or "HOST:PORT") and `ros2` (True, or the domain) let others look on and stop; `allow_remote` lets
     them change gains as well.  Set-points are this program's alone.
 
-    Not for several threads.
+    Several threads may call it in real time; simulated time is for one.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Joint(Program):
         """At simulated time only: one cycle with this torque [Nm] instead of the law's; the state after it.
 
         For laws in Python.  Limits of torque, rate, position and velocity hold as ever; there is no set-point, so that
-        nothing else is watched.
+        nothing else is watched, and from then on motions and set-points are refused.
         """
         motor = self._simulated("step_torque")
         motor.step_torque((finite("torque_Nm", torque_Nm),))

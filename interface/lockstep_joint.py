@@ -71,9 +71,15 @@ class LockstepMotor:
                 break
             self._run.step(1)
         if phase is AxisPhase.TRACKING:
-            self.require()
+            self._require_tracking()
 
     def require(self) -> None:
+        """See `Motor`."""
+        self._require_tracking()
+        if self._outside:
+            raise UsageError("the torque is the program's since step_torque: no motion or set-point would be followed")
+
+    def _require_tracking(self) -> None:
         joints = zip(self.axes.joints, self.axes.names, self.axis, strict=True)
         for config, name, axis in sorted(joints, key=lambda joint: int(joint[2].fault_slot_ns)):
             fault = Fault(int(axis.fault))
@@ -103,7 +109,7 @@ class LockstepMotor:
 
     def wait(self, seconds: float) -> None:
         self._run.step(max(1, round(seconds / self._period_s)))
-        self.require()
+        self._require_tracking()
 
     def step_torque(self, torques_Nm: Sequence[float]) -> None:
         if not self._outside:

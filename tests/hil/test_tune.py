@@ -506,6 +506,10 @@ def test_what_cannot_be_is_refused_before_anything_moves(tmp_path: Path) -> None
             tune(load_config(path), output, options=options)
     with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
         tune(load_config(shipped_config("precise")), output, options=TuneOptions(lockstep=True))
+    wrong = written(tmp_path / "wrong.toml", "precise", joint__torque_constant_NmpA=0.8)
+    with pytest.raises(ConfigurationError, match=r"is 8 times drive.rated_torque_Nm \(=0.5\): one of them is wrong"):
+        tune(load_config(wrong), output, options=TuneOptions(lockstep=True))
+    assert not (tmp_path / "wrong.tune").exists()
     with pytest.raises(DataError, match=r"steps.json: cannot be read"):
         tune(load_config(path), output, options=TuneOptions(lockstep=True, resume=True))
     with pytest.raises(UsageError, match=r"--legs \(=2\) must be in \[8..100\]"):

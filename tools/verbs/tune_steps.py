@@ -64,6 +64,7 @@ from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
+from jointctl.tools.sweeping.plan import refuse_constants
 from jointctl.tools.tuning.carry_out import (
     ALONE,
     LEAST_LEGS,
@@ -135,6 +136,7 @@ class Tune:
 
     def __post_init__(self) -> None:
         require_encoders(self.original, self.options.law)
+        refuse_constants(self.original)
         self.config = with_torque_limit(self.original, self.options.torque_Nm)
         response_task(self.config, None, AS_IT_FITS.legs)  # what does not fit is refused before anything moves
         self.verifying = verifying_motion(self.config)

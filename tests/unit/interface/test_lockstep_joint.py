@@ -289,6 +289,22 @@ def test_a_law_in_python_holds_the_joint() -> None:
         assert abs(state.position_rad - target_rad) < 5e-3
 
 
+def test_after_a_torque_of_ones_own_no_motion_is_promised() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        joint.step_torque(0.0)
+        at_rad = joint.state.desired_position_rad
+        for move in (
+            lambda: joint.move_to(0.3),
+            lambda: joint.follow([0.0, 1.0], [0.1, 0.2]),
+            lambda: joint.command(0.1),
+        ):
+            with pytest.raises(jointctl.UsageError, match="no motion or set-point would be followed"):
+                move()
+        joint.wait(0.1)  # with the last torque
+        assert joint.state.desired_position_rad == at_rad
+
+
 def test_a_stop_takes_the_torque_of_ones_own_law_away() -> None:
     with Joint("virtual", lockstep=True) as joint:
         joint.enable()
