@@ -94,9 +94,10 @@ FEW_DECADES = 100.0  # between the ends of a logarithmic axis
 def _label_logarithmic(figure: Figure) -> None:
     """Powers of ten as "10³": formulas are not set (`text.parse_math`), since a name may look like one.
 
-    On an axis of few decades 1, 2 and 5 of each: there may be no power, and labels of all steps would overlap.
+    On an axis of few decades 1, 2 and 5 of each: there may be no power, and labels of all steps would overlap.  Where
+    there is one of these alone, equal steps.
     """
-    from matplotlib.ticker import LogFormatterMathtext, LogFormatterSciNotation, LogLocator, NullFormatter
+    from matplotlib.ticker import AutoLocator, LogFormatterMathtext, LogFormatterSciNotation, LogLocator, NullFormatter
 
     class Powers(LogFormatterSciNotation):
         def __call__(self, x: float, pos: int | None = None) -> str:
@@ -109,7 +110,9 @@ def _label_logarithmic(figure: Figure) -> None:
                 continue
             low, high = sorted(axis.get_view_interval())
             if high < FEW_DECADES * low:
-                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                few = LogLocator(subs=(1.0, 2.0, 5.0))
+                several = sum(low <= at <= high for at in few.tick_values(low, high)) > 1
+                axis.set_major_locator(few if several else AutoLocator())
                 axis.set_major_formatter(lambda x, _: f"{x:g}" if "e" not in f"{x:g}" else Powers()(x))
                 axis.set_minor_formatter(NullFormatter())
             else:

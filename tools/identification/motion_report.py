@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,9 +69,25 @@ def motion_report(found: MotionFit) -> RenderableType:
     return Group(*motion_tables(found), Text("\n".join([*lines, f"data SHA-256 {found.motion.sha256}"])))
 
 
+def _measured_statics(found: MotionFit) -> dict[str, float]:
+    """By direction, the static friction of the slowest speed used, at the motor, where the rise may be none.
+
+    Below that speed nothing was measured: a curve that rises further would be fed forward at every reversal.
+    """
+    slowest_radps, least = found.settings.speed_min_radps, {}
+    for word, one in found.branches().items():
+        rise = found.parameters.get(f"rise {word}") or found.parameters.get(f"rise {found.model.directions[0]}")
+        if rise is not None and rise.low <= 0.0:
+            share = float(np.exp(-slowest_radps / one.stribeck_radps))
+            least[word] = one.coulomb_Nm + share * (one.static_Nm - one.coulomb_Nm)
+    return least
+
+
 def motion_section(found: MotionFit) -> dict[str, Any]:
     """The [friction] section, with what depends on load and temperature where it was found."""
     branches, value = found.branches(), found.value
+    for word, static_Nm in _measured_statics(found).items():
+        branches[word] = replace(branches[word], static_Nm=static_Nm)
     values = section_values(branches["positive"], branches["negative"])
     load = {"coulomb": value.get("load_coulomb", 0.0), "viscous_spr": value.get("load_viscous", 0.0)}
     warm = {"coulomb_pK": value.get("temperature_coulomb", 0.0), "viscous_pK": value.get("temperature_viscous", 0.0)}
@@ -110,6 +127,9 @@ def motion_remarks(found: MotionFit) -> list[str]:
         joint.append(f"gravity_zero_rad = {result['gravity']['zero_rad']:.4g}")
     if joint:
         lines.append(f"for [joint]: {', '.join(joint)}")
+    for word in _measured_statics(found):
+        slowest = f"{found.settings.speed_min_radps:g} rad/s"
+        lines.append(f"ts_Nm {word}: that of {slowest}, slower than which nothing was used; its rise may be none")
     ripple = found.model.waves(found.value, "ripple", found.motion.reduction_ratio)[:HARMONICS]
     if ripple:
         keys = _wave_lists("torque_Nm", ripple) | (found.motion.mounting or {})

@@ -91,6 +91,20 @@ def test_every_parameter_of_a_known_joint_is_found_within_its_interval(loaded):
     assert found.to_dict()["gravity"]["zero_rad"] == pytest.approx(joint.gravity_zero_rad, abs=0.03)
 
 
+@pytest.mark.parametrize(("low", "held"), [(-0.1, True), (0.0, True), (0.1, False)])
+def test_a_rise_that_may_be_none_is_written_as_far_as_it_was_measured(loaded, low, held):
+    _, found = loaded
+    unsure = {**found.parameters, "rise positive": replace(found.parameters["rise positive"], low=low)}
+    found = replace(found, parameters=unsure)
+    whole, written = found.branches(), motion_section(found)
+    one = whole["positive"]
+    least = one.torque_Nm(np.array([SETTINGS.speed_min_radps]))[0] - one.viscous_Nmspr * SETTINGS.speed_min_radps
+    assert written["positive"]["ts_Nm"] == pytest.approx(least if held else one.static_Nm)
+    assert least < 0.95 * one.static_Nm
+    assert written["negative"]["ts_Nm"] == pytest.approx(whole["negative"].static_Nm)
+    assert any(line.startswith("ts_Nm positive: that of 0.05 rad/s") for line in motion_remarks(found)) is held
+
+
 def test_the_held_out_error_is_the_noise_and_halves_where_the_extension_is_allowed(loaded):
     _, found = loaded
     assert found.rmse_Nm(odd=True) < 1.15 * 0.3
