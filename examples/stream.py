@@ -31,11 +31,13 @@ def main() -> None:
         middle_rad, begun_s = joint.state.desired_position_rad, time.monotonic()
         while (now_s := time.monotonic() - begun_s) < SECONDS:
             share = min(now_s, SECONDS - now_s, 1.0) ** 2
+            position_rad = middle_rad + 0.05 * share * math.sin(math.pi * now_s)
             try:
-                joint.command(middle_rad + 0.05 * share * math.sin(math.pi * now_s), time_s=now_s)
+                joint.command(position_rad, time_s=now_s)
             except jointctl.SetPointError as error:  # the computer stood still for longer than stream.delay_s, say
                 print(error, file=sys.stderr)
-                joint.wait(0.2)
+                joint.move_to(position_rad)  # the joint rests on the way: go on from there
+                begun_s = time.monotonic() - now_s
             time.sleep(1.0 / RATE_Hz)
         joint.wait(0.3)
         print(f"at {joint.state.position_rad:+.4f} rad, {joint.state.phase}")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
@@ -178,9 +179,8 @@ def identify(
     from jointctl.tools.verbs.verb_options import config_path
 
     limits = None if config is None else joint_limits(config_path(Path(config)))
-    return identify_friction(
-        read_friction_data(Path(data), ForeignFormat(**(table or {}))), Options(**options), limits=limits
-    )
+    how = _made(Options, "identify", options)
+    return identify_friction(read_friction_data(Path(data), _made(ForeignFormat, "table", table)), how, limits=limits)
 
 
 def identify_motion(data: str | Path, *, table: dict[str, Any] | None = None, **settings: Any) -> MotionFit:
@@ -193,8 +193,16 @@ def identify_motion(data: str | Path, *, table: dict[str, Any] | None = None, **
     from jointctl.tools.identification.motion_data import MotionSettings
     from jointctl.tools.verbs.identify import motion_from
 
-    chosen = MotionSettings(**settings)
-    return motion_fit.identify_motion(motion_from(Path(data), ForeignFormat(**(table or {})), chosen), chosen)
+    chosen = _made(MotionSettings, "identify_motion", settings)
+    return motion_fit.identify_motion(motion_from(Path(data), _made(ForeignFormat, "table", table), chosen), chosen)
+
+
+def _made(kind: Any, what: str, given: dict[str, Any] | None) -> Any:
+    """A dataclass of these fields; `TypeError` as of the other functions for one that it does not have."""
+    known = [each.name for each in fields(kind)]
+    if unknown := [name for name in given or {} if name not in known]:
+        raise TypeError(f"{what} has no option {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    return kind(**(given or {}))
 
 
 def read_log(path: str | Path) -> RunLog:

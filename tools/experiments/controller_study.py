@@ -35,7 +35,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -409,7 +409,14 @@ class StudyResult:
     interrupted: bool
 
     def values(self, controller: str, figure: str) -> np.ndarray:
-        """One figure of one controller over the plants, shape (plants,); inf where a fault ended the run, nan: none."""
+        """One figure of one controller over the plants, shape (plants,); inf where a fault ended the run, nan: none.
+
+        `UsageError` for one that is not there.
+        """
+        figures = [each.name for each in fields(ErrorFigures) if each.name != "fault"]
+        for what, name, known in (("controller", controller, self.controllers), ("figure", figure, figures)):
+            if name not in known:
+                raise UsageError(f"{what} (={name}) must be one of {', '.join(known)}")
         column = self.controllers.index(controller)
         return np.array([getattr(plant.figures[column], figure) for plant in self.plants], dtype=np.float64)
 

@@ -427,7 +427,8 @@ class TerminalConsent:
 
 
 def require_terminal(
-    why: str = "this moves the joint and there is no terminal to ask on", hint: str = "give -y to move without asking"
+    why: str = "this moves the joint and there is no terminal to ask on",
+    hint: str = "give -y (in a program yes=True) to move without asking",
 ) -> None:
     """`UsageError` where nobody can be asked."""
     if not sys.stdin.isatty():

@@ -9,7 +9,7 @@ import typer
 from rich.console import Group
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import DataError
+from jointctl.drivers.errors import DataError, UsageError
 from jointctl.tools.verbs.verb_options import ResultOutput, Verb, Verbs, grouped
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def log_export(
     from jointctl.tools.written_file import replace_file
 
     if format not in FORMATS:
-        raise DataError(f"format (={format!r}) must be one of {', '.join(FORMATS)}")
+        raise UsageError(f"--format (={format}) must be one of {', '.join(FORMATS)}")
     ending, content = FORMATS[format]
     log = read_run_log(path)
     target = _target(path, out, ending)
@@ -127,10 +127,14 @@ def log_export(
 
 
 def _target(path: Path, out: Path | None, ending: str) -> Path:
+    from jointctl.tools.recording.run_log_reader import FORMATS
     from jointctl.tools.written_file import require_target
 
     target = out if out is not None else path.with_suffix(ending)
     require_target(target, (path,))
+    known = {".png", ".mcap", *(each for each, _ in FORMATS.values())}
+    if target.suffix in known and target.suffix != ending:  # most likely one that is there
+        raise UsageError(f"--out (={target}) is the name of another kind of file, must end in {ending}")
     return target
 
 

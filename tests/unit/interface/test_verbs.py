@@ -158,6 +158,10 @@ def test_a_value_of_the_wrong_type_or_beyond_its_bounds_is_named() -> None:
         jointctl.check()
     with pytest.raises(TypeError, match="takes 1 arguments without a name at most, not 2"):
         jointctl.check("virtual", 0.01)
+    with pytest.raises(TypeError, match=r"identify has no option 'quiet'; there are .*model, "):
+        jointctl.identify("none.csv", quiet=True)
+    with pytest.raises(TypeError, match=r"table has no option 'speed'; there are .*velocity_column"):
+        jointctl.identify_motion("none.csv", table={"speed": "v"})
 
 
 @pytest.mark.parametrize("name", verbs.VERBS)
@@ -176,6 +180,10 @@ def test_results_come_as_objects_and_nothing_is_printed(tmp_path: Path, capsys: 
     assert (swept.points, swept.data) == (8, str(data))
     studied = jointctl.study(plants=1, controllers=["pid"], after_s=1.0, workers=1, quiet=True)
     assert studied.values("pid", "rmse_mrad")[0] > 0.0
+    with pytest.raises(jointctl.UsageError, match=r"controller \(=paper\) must be one of pid"):
+        studied.values("paper", "rmse_mrad")
+    with pytest.raises(jointctl.UsageError, match=r"figure \(=rmse\) must be one of peak_mrad, rmse_mrad, "):
+        studied.values("pid", "rmse")
     assert capsys.readouterr().out == ""
     with pytest.raises(jointctl.DataError, match="exists already"):
         jointctl.sweep("sweep_virtual", out=data, lockstep=True)

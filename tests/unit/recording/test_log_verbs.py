@@ -21,7 +21,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault
+from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault, UsageError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -312,7 +312,7 @@ def test_parquet_without_pyarrow_says_what_to_install(made_log: Path, monkeypatc
 
 @pytest.mark.parametrize("format", ["", "xlsx", "CSV"])
 def test_a_format_that_is_none_is_refused(made_log: Path, format: str) -> None:
-    with pytest.raises(DataError, match=r"format .* must be one of csv, npz, parquet, candump"):
+    with pytest.raises(UsageError, match=r"--format .* must be one of csv, npz, parquet, candump"):
         log_export(made_log, Output(), format)
 
 
@@ -325,6 +325,11 @@ def test_the_log_itself_is_never_overwritten(made_log: Path, format: str) -> Non
         log_export(made_log, Output(), format, made_log.parent / "none" / "x")
     with pytest.raises(DataError, match="is an input of this command"):
         log_plot(made_log, Output(), made_log)
+    for name in {"other.mcap", "x.png", "x.csv", "x.npz"} - {f"x.{format}"}:
+        with pytest.raises(UsageError, match=f"is the name of another kind of file, must end in .{format}"):
+            log_export(made_log, Output(), format, made_log.parent / name)
+    with pytest.raises(UsageError, match=r"must end in \.png"):
+        log_plot(made_log, Output(), made_log.parent / "x.csv")
     assert made_log.read_bytes() == before
     assert format in FORMATS
 
