@@ -309,6 +309,8 @@ def _draw(axes: np.ndarray, records: np.ndarray, with_network: bool) -> None:
     axes[0].set_ylabel("joint angle [rad]")
     draw(axes[1], records["error_rad"] * 1e3, "error", BLUE)
     axes[1].set_ylabel("error q - q_d [mrad]")
+    if not np.any(records["feedback_torque_Nm"][on]):  # the drive closes the loop: its torque is not the command
+        draw(axes[2], records["measured_torque_Nm"], "measured", RED, powered=False, linewidth=0.8)
     draw(axes[2], records["command_torque_Nm"], "command", INK, powered=False, linewidth=1.4)
     for name, color in _PARTS.items():
         values = records[f"{name}_torque_Nm"]

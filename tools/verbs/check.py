@@ -144,9 +144,14 @@ def check_cascade(
         table.add_row(loop.name, value, "; ".join(notes))
     for row in bench_of(config).check_rows(config):
         table.add_row(*row)
+    wanted_deg = config.margin.min_phase_margin_deg
+    if found:
+        enough = all(loop.stable and loop.phase_margin_deg >= wanted_deg for loop in found)
+        wanted = f"at least {wanted_deg:g} deg wanted (margin.min_phase_margin_deg)"
+        table.add_row("verdict", "ok" if enough else "too small", wanted)
     data = {
         "mode": section.mode, "lead_s": lead, "loops": [asdict(loop) for loop in found],
-        "min_phase_margin_deg": config.margin.min_phase_margin_deg,
+        "min_phase_margin_deg": wanted_deg,
     }  # fmt: skip
     output.result(table, data)
     for text in cascade_unknowns(config):

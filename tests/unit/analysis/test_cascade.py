@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -232,6 +233,17 @@ def test_a_serial_drive_has_no_such_mode(tmp_path: Any) -> None:
     text = (CONFIGS / "elmo_serial.toml").read_text()
     found = problems(tmp_path, r'kind = "elmo_serial"', 'kind = "elmo_serial"\nmode = "csp"', text)
     assert any("drive.mode" in line for line in found)
+
+
+@pytest.mark.parametrize(("minimum_deg", "verdict"), [(60.0, "ok"), (61.0, "too small")])
+def test_check_has_a_verdict_on_the_drives_loops(minimum_deg: float, verdict: str) -> None:
+    said = io.StringIO()
+    config = shipped("csp", margin__min_phase_margin_deg=minimum_deg)
+    with contextlib.nullcontext() if verdict == "ok" else pytest.raises(MarginError):
+        check(config, Output(stdout=said, stderr=io.StringIO()))
+    (row,) = (line for line in said.getvalue().splitlines() if "verdict" in line)
+    assert f" {verdict} " in row
+    assert f"at least {minimum_deg:g} deg wanted" in row
 
 
 # --- a reducer that is not rigid: what the twist is away from the expected one is taken off the target ---

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
+from jointctl.tools.recording import run_summary
 from jointctl.tools.recording.run_summary import (
     TIMES,
     drawn_indices,
@@ -187,6 +189,23 @@ def test_the_figure_is_a_png_and_marks_the_fault(tmp_path: Path) -> None:
 
 def height_of(png: Path) -> int:
     return int.from_bytes(png.read_bytes()[20:24], "big")  # of the IHDR chunk
+
+
+@pytest.mark.parametrize("closed_here", [True, False])
+def test_the_torque_of_a_drive_that_closes_the_loop_is_drawn(
+    monkeypatch: pytest.MonkeyPatch, closed_here: bool
+) -> None:
+    records, labels = run_records(), list[str]()
+
+    def drawn(figure: Figure, path: Path) -> Path:
+        labels.extend(str(line.get_label()) for line in figure.axes[2].get_lines())
+        return path
+
+    records["feedback_torque_Nm"] = 1.0 if closed_here else 0.0
+    monkeypatch.setattr(run_summary, "save_png", drawn)
+    save_run_figure(records, Path("run.png"), "run")
+    assert ("measured" in labels) is not closed_here
+    assert "command" in labels
 
 
 def test_a_law_without_network_has_neither_its_panel_nor_its_row(tmp_path: Path) -> None:
