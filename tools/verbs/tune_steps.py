@@ -445,9 +445,7 @@ class Tune:
     def _take_map(self, kept: dict[str, Any]) -> None:
         self.carrier.output.note("  measured" if kept else "  none: it is for a soft reducer with two encoders")
         if kept and self.config.reducer is not None:
-            values: dict[str, Any] = {
-                key: tuple(value) if isinstance(value, list) else value for key, value in kept.items()
-            }
+            values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in kept.items()}
             reducer = self.config.reducer.model_copy(update={"map": ReducerMap(**values)})
             self.config = self.config.model_copy(update={"reducer": reducer})
 

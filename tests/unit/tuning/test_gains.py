@@ -248,7 +248,7 @@ def test_a_late_joint_gets_the_loop_that_holds_what_disturbs_a_motion() -> None:
 def test_a_noisy_encoder_of_the_link_gets_a_lower_filter_and_leaves_a_quicker_observer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The noise that is allowed left an observer of 71 rad/s behind 60 Hz; of an encoder with more counts 60 Hz cost nothing."""
+    """The noise that is allowed left an observer of 71 rad/s behind 60 Hz."""
     settings, _ = loop_settings(config := of_study(71193, 28))
     found = gains_of_file(config, settings)
     both = LAWS["two_encoders"]
