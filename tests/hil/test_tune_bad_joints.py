@@ -127,14 +127,14 @@ def test_an_inertia_of_less_than_half_gets_the_stiffer_law(tmp_path: Path) -> No
     """With the weak one the reference went 50 mrad, where a leg turned back, before the torque had turned."""
     carrier = watched(FirstStages)
     with pytest.raises(NotCarriedOut):
-        Tune(too_light(0.8), TuneOptions(lockstep=True), carrier, tmp_path).carry_out("")
+        Tune(too_light(0.8), TuneOptions(lockstep=True), carrier, tmp_path).carry_out()
     assert carrier.motions == 2  # the direction, and the first stage
 
 
 def test_a_law_that_is_far_too_weak_says_what_it_may_be(tmp_path: Path) -> None:
     carrier = watched()
     with pytest.raises(MotionFault, match="POSITION_FROZEN") as raised:
-        Tune(too_light(0.1), TuneOptions(lockstep=True), carrier, tmp_path).carry_out("")
+        Tune(too_light(0.1), TuneOptions(lockstep=True), carrier, tmp_path).carry_out()
     assert "where joint.inertia_kgm2 (=0.1) is too small" in raised.value.hint
     assert "the encoder or its cable is dead" in raised.value.hint
     assert carrier.motions == 4  # the direction, and three laws

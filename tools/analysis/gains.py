@@ -1,7 +1,7 @@
 """Gains for a joint, identified or believed: the least modelled error that keeps the margins wherever it may be.
 
     phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
-    (33 and 2.4 of a soft joint with both encoders;         and lag at the late end, link at both ends of the payload
+    (|S| <= 2.4 of a soft joint with both encoders;         and lag at the late end, link at both ends of the payload
     25, 1.7 and 3 where friction rules the joint)
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
@@ -81,8 +81,9 @@ RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 RIPPLE_OF_TWO_radps = 100.0  # measured, docs/law.md: what disturbs such a joint falls with the frequency up to there
 LEARNING_FACTOR = 0.9  # of a repetition, wanted
 SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
+LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
 _LOWEST_Hz, _POINTS = 0.3, 240
-_NEAR = (0.65, 1.3, 80)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
+_NEAR = (0.65, 1.3, 120)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 3, 90
 _AGAIN = (0.3, -0.2, 0.2)  # from the best one
 
@@ -115,7 +116,6 @@ class Law:
     usual_observer_radps: float | None = None
     most_noise_Nm: float = math.inf
     ripple_radps: float = RIPPLE_radps
-    phase_margin_deg: float = PHASE_MARGIN_deg
     sensitivity: float = SENSITIVITY
     encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
     of_soft: tuple[tuple[float, float, int], ...] | None = None  # `spans` of a soft joint, where they are others
@@ -189,7 +189,7 @@ LAWS = {
     "two_encoders": replace(
         _MOTOR_ENCODER, name="two_encoders", keys=("kv", "observer_radps", "link_cutoff_Hz", "cutoff_Hz"),
         spans=((4.0, 60.0, 6), (12.0, 110.0, 6), (30.0, USUAL_LINK_CUTOFF_Hz, 2), (8.0, 450.0, 3)),
-        phase_margin_deg=33.0, sensitivity=2.4, encoders=Encoders.BOTH,  # 35 and 2 are far softer where much is late
+        sensitivity=2.4, encoders=Encoders.BOTH,  # 2 is far softer where much is late
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -474,7 +474,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     from scipy.optimize import minimize  # here: only a search waits for it
 
     noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
-    ends = zip((law.phase_margin_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
+    ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     gate_deg, gate_s = config.margin.min_phase_margin_deg / GRID_SPARE, GRID_SPARE * settings.largest_s
     goals = Goals(noise_Nm, gate_deg, gate_s, *wanted)
@@ -582,18 +582,19 @@ def apart(one: LoopSettings, other: LoopSettings) -> float:
 def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
     """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain.
 
-    Where that brings none to `LEARNING_FACTOR`, the quickest gains that converge at all; None where none do.
+    Where that brings none to `LEARNING_FACTOR`, the quickest that converges, of a late loop the next one; or None.
     """
     if learning is None or settings.kind not in OBSERVING:
         return None
-    slow = None
+    slow: list[tuple[float, Learning]] = []
     for _ in range(8):
         factor = learning_convergence(settings, learning).worst_factor
         if factor <= LEARNING_FACTOR:
             return learning
-        if slow is None and factor <= SLOWEST_LEARNING_FACTOR:
-            slow = learning
+        if factor <= SLOWEST_LEARNING_FACTOR:
+            slow.append((factor, learning))
         learning = learning.model_copy(
             update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
         )
-    return slow
+    late = len(slow) > 1 and slow[0][0] > LATE_LEARNING_FACTOR
+    return slow[int(late)][1] if slow else None
