@@ -311,7 +311,7 @@ class LiveMotor:
             drive_end.require_off(self._session.drive_state)
 
     def _end(self) -> None:
-        """Ask for the end, and wait for it whatever is raised here meanwhile: by a signal of the program's, say.
+        """Ask for the end, and wait for it whatever is raised here in between: by a signal of the program's, say.
 
         Ctrl-C asks for more, as in `jointctl run`.
         """

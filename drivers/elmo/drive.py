@@ -441,7 +441,7 @@ class ElmoDrive:
             raise DeviceError(f"the fault cannot be cleared while its cause remains: {cause}")
         set_torque_mode(line)
         off = b"TC=0\rMO=0\r"
-        try:  # in one go: the drive has all of it although this program dies meanwhile
+        try:  # in one go: the drive has all of it even if this program dies
             line.ask(encode("MO", value=1), 1, behind=off)
         finally:
             self._byte_port.write(b"\r" + off)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from jointctl.tools.verbs.tune_steps import Tune
 
-GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz")  # that are shown
+GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz", "link_cutoff_Hz")  # that are shown
 
 
 def values_of(job: Tune) -> list[Found]:
@@ -101,7 +101,7 @@ def _tables(job: Tune) -> tuple[Table, Table]:
         table.add_row(name, *shown)
     for key in GAINS:
         pair = [getattr(config.control, key) for config in (job.original, job.config)]
-        if any(pair):
+        if any(pair) and (key != "link_cutoff_Hz" or job.config.joint_encoder is not None):
             table.add_row(key, *(f"{value:g}" for value in pair))
     for name in gains["missed"]:
         table.add_row("missed", "", name)
