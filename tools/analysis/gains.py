@@ -130,8 +130,7 @@ class Law:
         if self.usual_observer_radps is not None:
             far += math.log(settings.observer_radps / self.usual_observer_radps) ** 2
         if "link_cutoff_Hz" in self.keys:
-            usual_Hz = min(USUAL_LINK_CUTOFF_Hz, LINK_CUTOFF * settings.cutoff_Hz)
-            far += math.log(settings.link_cutoff_Hz / usual_Hz) ** 2
+            far += math.log(settings.link_cutoff_Hz / _highest_link_cutoff_Hz(settings.cutoff_Hz)) ** 2
         return UNUSUAL * far
 
     def settings(self, settings: LoopSettings, logarithms: Array) -> LoopSettings:
@@ -141,8 +140,8 @@ class Law:
         }
         if "cutoff_Hz" in values:
             values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
-            link_Hz = min(USUAL_LINK_CUTOFF_Hz, float(f"{LINK_CUTOFF * values['cutoff_Hz']:.3g}"))
-            values["link_cutoff_Hz"] = min(values.get("link_cutoff_Hz", math.inf), link_Hz)
+            highest_Hz = _highest_link_cutoff_Hz(values["cutoff_Hz"])
+            values["link_cutoff_Hz"] = min(values.get("link_cutoff_Hz", math.inf), highest_Hz)
         values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
         if "observer_radps" in values:
             values["observer_radps"] = max(values["observer_radps"], LEAST_OBSERVER_radps)
@@ -151,15 +150,15 @@ class Law:
         return replace(settings, **values)
 
     def logarithms(self, settings: LoopSettings) -> Array:
-        """What `settings` takes; of a filter of the link that only follows the velocity's, the usual one."""
+        """What `settings` takes; of a filter of the link that is as high as the velocity's allows, the usual one."""
         values = {key: np.max(getattr(settings, key)) for key in self.keys}
-        if "link_cutoff_Hz" in values and values["link_cutoff_Hz"] >= LINK_CUTOFF * settings.cutoff_Hz:
+        if values.get("link_cutoff_Hz", 0.0) >= _highest_link_cutoff_Hz(settings.cutoff_Hz):
             values["link_cutoff_Hz"] = USUAL_LINK_CUTOFF_Hz
         return np.log(list(values.values()))
 
     def free(self, logarithms: Array) -> Array:
         """Indices of the values that count there: the link's filter does not behind a lower one of all velocity."""
-        low = math.exp(logarithms[-1]) * LINK_CUTOFF < USUAL_LINK_CUTOFF_Hz
+        low = _highest_link_cutoff_Hz(math.exp(logarithms[-1])) < USUAL_LINK_CUTOFF_Hz
         return np.array([i for i, key in enumerate(self.keys) if not (low and key == "link_cutoff_Hz")])
 
     def starts(self, best_first: list[Judged]) -> list[Array]:
@@ -170,6 +169,11 @@ class Law:
             if all(abs(x[-1] - other[-1]) > 1.0 for other in found):
                 found.append(x)
         return found[:_STARTS]
+
+
+def _highest_link_cutoff_Hz(cutoff_Hz: float) -> float:
+    """Of the filter of the link's velocity behind one of `cutoff_Hz` of all velocity; to three digits."""
+    return float(f"{min(USUAL_LINK_CUTOFF_Hz, LINK_CUTOFF * cutoff_Hz):.3g}")
 
 
 _MOTOR_ENCODER = Law(
@@ -310,8 +314,9 @@ def joints_within(config: Config, intervals: Intervals) -> list[float | TwoMasse
     payload = sorted({1.0, *config.margin.payload_range})
     ends = (1.0, 1.0 - inertia, 1.0 + inertia)
     if config.reducer is None:
-        factors = [p * end for p in payload for end in ends] if _payload_given(config) else list(ends)
-        return [config.joint.inertia_kgm2 * factor for factor in (1.0, *factors)]
+        if "payload_range" not in config.margin.model_fields_set:  # that by itself is of a link behind a soft reducer
+            payload = [1.0]
+        return [config.joint.inertia_kgm2 * factor for factor in (1.0, *(p * end for p in payload for end in ends))]
     stiffness = max(intervals.stiffness, LEAST_STIFFNESS_SHARE)
     believed = two_masses(config, config.reducer, 1.0, 1.0, False)
     found = [believed, *(replace(believed, motor_kgm2=end * believed.motor_kgm2) for end in ends[1:])]
@@ -354,11 +359,6 @@ def lossless_joints(config: Config) -> list[TwoMasses]:
         return []
     joints = [two_masses(config, reducer, 1.0, stiffness, False) for stiffness in (SOFTEST, 1.0)]
     return [replace(one, damping_Nmspr=min(one.damping_Nmspr, LEAST_DAMPING * one.critical_Nmspr)) for one in joints]
-
-
-def _payload_given(config: Config) -> bool:
-    """Whether the file names a payload: the automatic range is that of a link behind a soft reducer."""
-    return "payload_range" in config.margin.model_fields_set
 
 
 def latest_s(settings: LoopSettings, intervals: Intervals) -> float:
