@@ -93,15 +93,18 @@ def test_creep_tells_a_law_that_sticks_from_one_that_does_not() -> None:
     base = shipped("precise", trajectory__duration_s=20.0)
     config = random_plant(base, EnsembleSettings(stick_slip_share=1.0), 3, 0)
     joint, motion = LockstepJoint(config), random_motion("creep", 3, 0, 20.0)
-    stuck = {}
+    stuck, later = {}, {}
     for controller in named(("computed_torque", "precise")):
         constants = controller_constants(config, controller, joint.report.start_position_rad)
         run = run_scenario(joint, constants, "creep", motion=motion)
-        stuck[controller.name] = error_figures(run, 2.0, motion).stuck_share
+        figures = error_figures(run, 2.0, motion)
+        stuck[controller.name], later[controller.name] = figures.stuck_share, figures.stuck_later_share
     assert stuck["computed_torque"] is not None
     assert stuck["precise"] is not None
     assert stuck["computed_torque"] > 0.5
     assert stuck["precise"] < 0.5 * stuck["computed_torque"]
+    assert later["computed_torque"] > 0.5, "that of a law that sticks goes on"
+    assert later["precise"] == 0.0 < stuck["precise"], "static friction lets go at a turn, and later no more"
 
 
 @pytest.mark.parametrize("flexible", [False, True])

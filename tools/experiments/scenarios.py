@@ -245,6 +245,7 @@ class ErrorFigures:
     # of a motion with rests: share of them in which the measured error is within one count or 20 urad from 50 ms on
     settled_share: float | None = None
     stuck_share: float | None = None  # of creep: share of the time in which the joint stands still
+    stuck_later_share: float | None = None  # the same from `TURNED_S` after a turn on
     phase_margin_deg: float | None = (
         None  # of the loop that is believed, with the joint's true delay where that is known
     )
@@ -266,6 +267,7 @@ REST_BAND_rad = 20e-6
 REST_AFTER_S = 0.05
 _STUCK_WINDOW_S = 0.05
 _STUCK = 0.1  # of the distance that it should go
+TURNED_S = 0.5  # after which static friction that let go at a turn, all at once, has been forgotten
 
 
 def settled_share(time_s: np.ndarray, error_rad: np.ndarray, rests_s: np.ndarray, within_rad: float) -> float | None:
@@ -280,15 +282,21 @@ def settled_share(time_s: np.ndarray, error_rad: np.ndarray, rests_s: np.ndarray
     return float(np.mean(settled)) if settled else None
 
 
-def stuck_share(run: LockstepRun, after_s: float) -> float:
-    """Share of a creeping motion, but for its turns, in which the joint goes less than a tenth of the way."""
+def stuck_share(run: LockstepRun, after_s: float, turned_s: float = 0.0) -> float:
+    """Share of a creeping motion, but for its turns, in which the joint goes less than a tenth of the way.
+
+    Of what comes `turned_s` after a turn or later.
+    """
     tracking = run.tracking
     log = run.log[tracking]
     position = run.truth[tracking, TRUE_POSITION_rad]
     window = round(_STUCK_WINDOW_S / float(log.trajectory_s[1] - log.trajectory_s[0]))
-    asked = np.abs(log.desired_position_rad[window:] - log.desired_position_rad[:-window])
-    moved = np.abs(position[window:] - position[:-window])
-    counts = (log.trajectory_s[window:] >= after_s) & (asked > 0.99 * CREEP_radps * _STUCK_WINDOW_S)
+    time_s = log.trajectory_s[window:]
+    way = log.desired_position_rad[window:] - log.desired_position_rad[:-window]
+    turns_s = np.where(np.diff(np.sign(way), prepend=0.0) != 0.0, time_s, -math.inf)
+    asked, moved = np.abs(way), np.abs(position[window:] - position[:-window])
+    counts = (time_s >= after_s) & (asked > 0.99 * CREEP_radps * _STUCK_WINDOW_S)
+    counts &= time_s - np.maximum.accumulate(turns_s) >= turned_s
     return float(np.mean(moved[counts] < _STUCK * asked[counts]))
 
 
@@ -304,11 +312,12 @@ def error_figures(
     late = time_s >= after_s
     measured = error[late] * 1e3
     true = run.true_error_rad[tracking][late] * 1e3
-    settled = stuck = None
+    settled = stuck = stuck_later = None
     if motion is not None:
         rests = motion.rests_s[(motion.rests_s[:, 0] >= after_s) & (motion.rests_s[:, 1] <= time_s[-1])]
         settled = settled_share(time_s, error, rests, max(count_rad, REST_BAND_rad))
-        stuck = stuck_share(run, after_s) if motion.kind == "creep" else None
+        if motion.kind == "creep":
+            stuck, stuck_later = stuck_share(run, after_s), stuck_share(run, after_s, TURNED_S)
     return ErrorFigures(
         fault="",
         peak_mrad=float(np.max(np.abs(measured))),
@@ -322,4 +331,5 @@ def error_figures(
         chatter_Nm=float(np.mean(np.abs(np.diff(run.log.command_torque_Nm[tracking][late])))),
         settled_share=settled,
         stuck_share=stuck,
+        stuck_later_share=stuck_later,
     )

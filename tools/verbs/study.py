@@ -51,6 +51,7 @@ _COLUMNS = (
     ("phase_margin_deg", "margin [deg]"),
     ("settled_share", "settled [share]"),
     ("stuck_share", "stuck [share]"),
+    ("stuck_later_share", "stuck later [share]"),
 )
 _MEANINGS = (
     ("rmse_mrad", "peak and RMSE as the encoder shows them"),
@@ -58,7 +59,10 @@ _MEANINGS = (
     ("settling_s", "settling: until the error stays within 1 mrad"),
     ("chatter_Nm", "chatter: mean change of the torque command in a cycle"),
     ("settled_share", "settled: share of the moves after which the error is within 1 count or 20 urad from 50 ms on"),
-    ("stuck_share", "stuck: share of a creeping motion in which the joint stands"),
+    (
+        "stuck_share",
+        "stuck: share of a creeping motion in which the joint stands; later: from 0.5 s after each turn on",
+    ),
 )
 _BOXES = (
     "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
