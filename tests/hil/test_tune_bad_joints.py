@@ -8,6 +8,8 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Container
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,13 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import JointctlError, MotionFault
-from jointctl.firmware_py.states import AxisPhase
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.output import Output
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import Motion, TerminalConsent
 from jointctl.tools.tuning.carry_out import Carried, Carrier, NotCarriedOut
 from jointctl.tools.verbs.tune import TuneOptions
@@ -34,7 +39,7 @@ class Watched(Carrier):
 
     heavier, since, motions = 1.0, 1_000, 0
 
-    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: Container[Fault] = ()) -> Carried:
         self.motions += 1
         assert config.virtual is not None
         if self.motions >= self.since:
@@ -45,7 +50,7 @@ class Watched(Carrier):
 class PutOnMidway(Watched):
     """A payload that is put on in the middle of the `since`-th motion: its second half is that of a heavier joint."""
 
-    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: Container[Fault] = ()) -> Carried:
         carried = super().run(config, motion, title, also_faults=also_faults)
         if self.motions != self.since:
             return carried
@@ -73,7 +78,7 @@ def ended(path: Path, carrier: Watched, text: str) -> tuple[str, dict[str, Any]]
     return line, json.loads(kept.read_text()) if kept.exists() else {}
 
 
-def watched(kind: type[Watched] = Watched) -> Watched:
+def watched(kind: type[Any] = Watched) -> Any:
     output = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
     return kind(output, TerminalConsent(output, assume_yes=True), None)
 
@@ -107,10 +112,24 @@ def test_a_fault_in_a_step_ends_it_in_one_line(tmp_path: Path, kind: str, at_s: 
         assert len((path.with_suffix(".tune") / "friction.csv").read_text().splitlines()) > 3
 
 
+@pytest.mark.parametrize("title", ["the same before", "refinement", "verification"])
+@pytest.mark.parametrize("fault", [Fault.LIMIT_CYCLE, Fault.VELOCITY_LIMIT, Fault.POSITION_JUMP, Fault.STALE_SAMPLE])
+def test_only_a_fault_of_the_gains_lets_a_tune_go_on_to_its_next_motion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, title: str, fault: Fault
+) -> None:
+    """An encoder that jumped while other gains were tried was a line of the report, and the joint was enabled again."""
+    carrier, config = watched(Carrier), shipped("precise")
+    ended = Carried(new(LogRecord, 10), fault, FaultText("happened", "cause", "next"), "")
+    monkeypatch.setattr(Carrier, "_simulated", lambda *_: ended)
+    goes_on = title != "verification" and fault in (Fault.LIMIT_CYCLE, Fault.VELOCITY_LIMIT)
+    with nullcontext() if goes_on else pytest.raises(MotionFault, match=f"{title}: {fault.name}"):
+        assert Tune(config, TuneOptions(), carrier, tmp_path)._verified(config, title) == {"fault": fault.name}
+
+
 class FirstStages(Watched):
     """Ends with the first stage of the response that measured."""
 
-    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: Container[Fault] = ()) -> Carried:
         carried = super().run(config, motion, title, also_faults=also_faults)
         if "response" in title and carried.text is None:
             raise NotCarriedOut(self.drive_state)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -112,10 +112,10 @@ class Carrier:
         """For a part whose result is not that of the command."""
         return replace(self.output, quiet=True, json=False, taken=lambda _: None)
 
-    def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
-        """The records; `MotionFault` after a fault unless `also_faults`, `NotCarriedOut` where it was not begun."""
+    def run(self, config: Config, motion: Motion, title: str, *, also_faults: Container[Fault] = ()) -> Carried:
+        """The records; `MotionFault` after any other fault than these, `NotCarriedOut` where it was not begun."""
         carried = self._simulated(config, motion) if self.control is None else self._moved(config, motion, title)
-        if carried.text is not None and not also_faults:
+        if carried.text is not None and carried.fault not in also_faults:
             raise _ended(title, carried)
         return carried
 
@@ -479,19 +479,21 @@ def _stage(
     """Once more where legs were lost to a computer that stood still for a moment: a tune of minutes need not end."""
     motion = task.motion(peak_Nm, pairs)
 
-    def measured() -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    def moved() -> Any:
         title = f"{task.config.path.stem}: response, {text_Nm(peak_Nm, 2)}"
-        carried = carrier.run(task.config, motion, title, also_faults=True)
+        carried = carrier.run(task.config, motion, title, also_faults=tuple(Fault))
         if carried.text is not None:
             ended = _ended(title, carried)
             if _too_weak(task.config, carried, peak_Nm):
                 raise TooWeak(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
             swung_fast = carried.fault == Fault.LIMIT_CYCLE and carried.value >= HUNTING_Hz
             raise TooStiff(ended.message, ended.hint) if swung_fast else ended
-        return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan
+        return carried.records
 
+    records = moved()
     try:
-        return measured()
+        return response_of(task.config, motion.plan, records), records, motion.plan
     except DataError as error:
         carrier.output.note(f"  {error.message}: once more")
-    return measured()
+    records = moved()
+    return response_of(task.config, motion.plan, records), records, motion.plan

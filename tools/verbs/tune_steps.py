@@ -102,6 +102,7 @@ OTHER = "of another drive, or of a simulated joint instead of a real one"
 FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
                  Fault.POSITION_LIMIT)  # fmt: skip
+OF_GAINS = (Fault.LIMIT_CYCLE, Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
 SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
           "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
@@ -231,7 +232,7 @@ class Tune:
             plan = make_plan(config, min(torque_Nm, config.limits.torque_max_Nm))
             inner = config_of_check(config, plan)
             try:
-                carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=True)
+                carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=tuple(Fault))
             except MarginError as error:  # gains of the file are none of the check
                 raise MarginError(error.message, SOFTER) from None
             findings = list(motion_findings(config, plan, carried.records, carried.fault, carried.text))
@@ -534,8 +535,7 @@ class Tune:
         seconds = self.verifying.duration_s
         moving = with_motion(config, self.verifying)
         motion = ConfiguredMotion(moving, trajectory_table(moving))
-        also = title != "verification"
-        carried = self.carrier.run(moving, motion, title, also_faults=also)
+        carried = self.carrier.run(moving, motion, title, also_faults=() if title == "verification" else OF_GAINS)
         rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
         rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * seconds)]
         if carried.text is not None or not len(rows):

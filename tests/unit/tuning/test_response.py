@@ -527,7 +527,7 @@ def test_a_stage_whose_legs_were_lost_is_measured_once_more(
             raise DataError("legs that were measured (=3) must be at least 4")
         return "response"
 
-    def run(_: Any, __: Any, title: str, *, also_faults: bool) -> Any:
+    def run(_: Any, __: Any, title: str, *, also_faults: Any) -> Any:
         runs.append(title)
         return SimpleNamespace(records="records", text=None)
 
@@ -539,3 +539,17 @@ def test_a_stage_whose_legs_were_lost_is_measured_once_more(
         assert (found, records, len(plan.legs.starts)) == ("response", "records", 4)
     assert len(runs) == measured
     assert len(said) == min(lost, 1)
+
+
+def test_a_stage_whose_log_could_not_be_written_is_not_moved_once_more() -> None:
+    """The disk was full, the joint was braked for it, and enabled again."""
+    runs: list[str] = []
+
+    def run(_: Any, __: Any, title: str, **_k: Any) -> Any:
+        runs.append(title)
+        raise DataError("runs: cannot be written: No space left on device")
+
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
+    with pytest.raises(DataError, match="No space left"):
+        carry_out._stage(response_task(shipped("precise"), None, AS_IT_FITS.legs), carrier, 1.0, 2)
+    assert len(runs) == 1
