@@ -116,7 +116,8 @@ class ElmoPort:
     status: i8  # SR
     motor_fault: i8  # MF
     fault_seen: i4  # status replies that showed a fault
-    unit_mode: i4  # of the last status; 0 = none yet
+    unit_mode: i4  # of the last status that is believed; 0 = none yet
+    odd_modes: i4  # status replies in a row with another unit mode than that of the run
     has_been_on: i4  # 1: MO=1 has done its work; it is never said again
     enable_wait_cycles: i8
     no_sample_cycles: i8
@@ -202,16 +203,20 @@ def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, b
 def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
     """SR: servo, fault, and the unit mode, which is another one after a restart of the drive.
 
-    The first status counts as well: commissioning has read the unit mode back.
+    The first status counts as well: commissioning has read the unit mode back.  The line has no checksum: a reply with
+    another mode may be a damaged one, and nothing of it is believed until that of the next cycle says the same.
     """
+    mode = status >> UNIT_MODE_SHIFT & UNIT_MODE_MASK
+    run_mode = UnitMode.SPEED if port.target_is_velocity != 0 else UnitMode.TORQUE
+    port.odd_modes = port.odd_modes + 1 if mode != run_mode else 0
+    if port.odd_modes == 1:
+        return
+    if port.odd_modes == 2:
+        sample.restarts += 1
+    port.unit_mode = mode
     port.status = status
     port.no_status_cycles = 0
     sample.status_word = status & 0x7FFFFFFF
-    mode = status >> UNIT_MODE_SHIFT & UNIT_MODE_MASK
-    run_mode = UnitMode.SPEED if port.target_is_velocity != 0 else UnitMode.TORQUE
-    if mode != run_mode and (port.unit_mode == run_mode or port.unit_mode == 0):
-        sample.restarts += 1
-    port.unit_mode = mode
     if status & (FAULT_LATCHED | AMPLIFIER_MASK) != 0:
         # the cause (MF) is asked for before the fault is reported; the power stage is off already
         port.fault_seen += 1
@@ -417,7 +422,7 @@ def _put_target(port: ElmoPort, command: Command, live: bool) -> None:
     """Torque or velocity of this cycle, zero unless `live`.  No BG in another unit mode: it begins another motion."""
     if port.target_is_velocity != 0:
         put_command(port, Question.JV, 1000 * velocity_cps(port, command.velocity_radps) if live else 0, 0)
-        if port.unit_mode == UnitMode.SPEED:
+        if port.unit_mode == UnitMode.SPEED and port.odd_modes == 0:
             put_command(port, Question.BG, 0, -1)
     else:
         put_command(port, Question.TC, current_mA(port, command.torque_Nm) if live else 0, 3)
@@ -523,7 +528,7 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
         return  # the answer to a question would keep the line from becoming silent
     if port.fault_seen > 0 and port.motor_fault == 0:
         put_command(port, Question.MF, 0, -1)
-    if port.cycle % 2 == 0 or port.fault_seen > 0:
+    if port.cycle % 2 == 0 or port.fault_seen > 0 or port.odd_modes == 1:
         put_command(port, Question.SR, 0, -1)
     else:
         put_command(port, Question.IQ, 0, -1)

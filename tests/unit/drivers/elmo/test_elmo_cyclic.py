@@ -30,7 +30,7 @@ from jointctl.drivers.elmo.cyclic import (
     take_byte,
     velocity_cps,
 )
-from jointctl.drivers.elmo.dialogue import ReplyKind, parse_reply
+from jointctl.drivers.elmo.dialogue import SERVO_ON, UNIT_MODE_SHIFT, ReplyKind, parse_reply
 from jointctl.drivers.elmo.exchange import link_of, receive
 from jointctl.firmware_py.records import LINE_GONE, Sample
 from jointctl.firmware_py.schema import new
@@ -284,9 +284,35 @@ class TestFaultsOfTheDrive:
     def test_a_restart_before_the_first_status_is_one_and_nothing_is_switched_on(self, talk: Talk) -> None:
         talk.device.execute(b"UM=5")
         talk.cycle(DriveRequest.OFF, count=2)
+        assert (talk.sample.restarts, talk.port.unit_mode) == (0, 0)  # one reply alone: it is asked again
+        assert talk.cycle(DriveRequest.OFF)[-1] == b"SR"
         assert talk.sample.restarts == 1
         said = [line for _ in range(2 * int(talk.port.enable_retry_cycles)) for line in talk.cycle()]
         assert (b"MO=1" in said, talk.device.m.motor_on, talk.sample.restarts) == (False, 0, 1)
+
+    @pytest.mark.parametrize("replies", [1, 2])
+    @pytest.mark.parametrize("speed", [False, True])
+    def test_one_damaged_status_is_no_restart_and_begins_nothing(self, speed: bool, replies: int) -> None:
+        """Without an echo nothing shows that a digit was changed; the next reply does."""
+        talk = Talk(echo=False, speed=speed).enabled()
+        status, left = talk.device.execute(b"SR").rstrip(b";"), [replies]
+        other = b"%d;" % (int(status) ^ 7 << UNIT_MODE_SHIFT ^ SERVO_ON)  # another unit mode, motor off
+
+        def spoil(reply: bytes) -> bytes:
+            if reply.rstrip(b";") != status or not left[0]:
+                return reply
+            left[0] -= 1
+            return other
+
+        talk.spoil = spoil
+        said = [line for _ in range(2) for line in talk.cycle()]
+        assert said[-1] == b"SR"
+        assert (talk.sample.restarts, talk.sample.drive_state) == (0, DriveState.ENABLED)
+        again = talk.cycle()
+        assert b"BG" not in again
+        assert again[-1] == b"SR"
+        talk.cycle(count=4)
+        assert (talk.sample.restarts, talk.sample.drive_state) == (int(replies == 2), DriveState.ENABLED)
 
 
 # --- The compiled exchange on a descriptor: a cycle that was held up, and its twin in time ---
