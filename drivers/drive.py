@@ -87,6 +87,12 @@ class SettingsGuard(Protocol):
         controller has sent what matters: the run is over.  Without `may_ask` nothing is sent.
         """
 
+    def mode_left(self) -> str:
+        """In words that the drive is in another mode than it was set to; asks it, and waits, once it is off.
+
+        "" where it is in its mode, or does not answer.
+        """
+
 
 class Drive(Protocol):
     """A drive on the way from unknown to commissioned, and back to safe."""

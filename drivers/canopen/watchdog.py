@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import can
 import canopen
 
 from jointctl.drivers.canopen.cia import EMERGENCY_ID, HEARTBEAT_ID, NmtState
@@ -32,7 +33,7 @@ from jointctl.drivers.canopen.pdo import (
 )
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
 from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError, JointctlError
 
 ABORT_QUICK_STOP = 3  # object 6007
 STOPPED = 2  # object 1029:1
@@ -47,6 +48,7 @@ POLLS_PER_TIMEOUT = 20
 LONGEST_TIMEOUTS = 4
 PERIOD_S = 1.0
 MISSED = 3  # reads in a row without an answer, until it is an error before enabling and a warning afterwards
+MODE_SHOWN = "modes of operation display"
 _HINT = "find out which; the run is over"
 _ALONE = "RPDOs that get lost while our heartbeat does not stop the joint only when the loop withholds its heartbeat"
 
@@ -325,13 +327,14 @@ class WatchdogGuard:
 
         `refuse_others` raises where another controller has sent a command, or has written what matters, since.
         """
+        self._objects, self._mode = objects, mode
         self._reads, self._node, self._refuse_others = reads, node, refuse_others
         self._changed = ""
         self._missed: dict[str, tuple[int, str]] = {}
         self._warned: set[str] = set()
         self._unread: set[str] = set()  # not yet read back in operational
         expected = {place: found for place, found in objects.verified().items() if is_kept(*place)}
-        expected[0x6061, 0] = (mode, "modes of operation display")
+        expected[0x6061, 0] = (mode, MODE_SHOWN)
         for (index, sub), (value, what) in expected.items():
             name = f"object {object_name(index, sub)} ({what})"
             data = objects.encoded(index, sub, value, what=what)
@@ -379,6 +382,13 @@ class WatchdogGuard:
                 self._warned.add(name)
                 warnings.append(text)
         return warnings
+
+    def mode_left(self) -> str:
+        """See `SettingsGuard.mode_left`."""
+        with contextlib.suppress(JointctlError, can.CanError):
+            if (shown := self._objects.read(0x6061, what=MODE_SHOWN)) != self._mode:
+                return f"node {self._node}: 6061 ({MODE_SHOWN}) is {shown} after the run, {self._mode} was set"
+        return ""
 
 
 def is_kept(index: int, sub: int) -> bool:

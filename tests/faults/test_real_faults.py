@@ -9,17 +9,23 @@ from __future__ import annotations
 import os
 import uuid
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
 
+from jointctl.drivers.canopen import watchdog
+from jointctl.drivers.canopen.cia import Mode
+from jointctl.drivers.errors import DeviceError
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.sections import FAULT_KINDS
+from jointctl.tools.session.control import Control, StopSignals
+from jointctl.tools.session.display import OnlyShows, Snapshot
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.virtual_joint import fault_constants
 from tests.configurations import written
@@ -120,6 +126,7 @@ def test_the_joint_is_stopped_and_disabled_and_the_user_is_told(
     assert text.happened
     assert text.cause
     assert text.next_step
+    assert "6061" not in text.happened
     assert once_enabled(result.records)
     assert np.abs(result.records.command_torque_Nm).max() <= 60.0
     assert (np.asarray(result.records.command_torque_Nm)[result.records.request != DriveRequest.ENABLE] == 0.0).all()
@@ -140,6 +147,77 @@ def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duratio
     tracked = result.records[result.records.phase == AxisPhase.TRACKING]
     assert tracked.trajectory_s[-1] == pytest.approx(1.2, abs=0.06)
     assert result.records.phase[-1] == AxisPhase.FINISHED
+
+
+# --- what is asked of the drive after the fault, and between two motions ---
+class AtTracking(OnlyShows):
+    """Does something to the drive once the joint tracks."""
+
+    def __init__(self, do: Callable[[], None]) -> None:
+        self._do: Callable[[], None] | None = do
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        pass
+
+    phase = note
+
+    def show(self, snapshot: Snapshot) -> None:
+        if self._do is not None and snapshot.record.trajectory_s > AT_s:
+            self._do()
+            self._do = None
+
+
+def short(tmp_path: Path, base: str) -> Config:
+    return load_config(written(
+        tmp_path / "joint.toml", base, bus__channel=f"fault-{os.getpid()}-{uuid.uuid4().hex[:8]}",
+        virtual__initial_position_rad=0.0, trajectory__duration_s=4.0, limits__sample_age_max_s=0.25,
+        limits__skipped_max_s=0.25,
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_a_drive_that_leaves_its_mode_by_itself_is_reported_as_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: bool
+) -> None:
+    """Its twin stands still in its mode.  6061 is read once a second: here once, before the joint is enabled."""
+    monkeypatch.setattr(watchdog, "PERIOD_S", 1000.0)
+    config = short(tmp_path, "csp")
+    with real_time_joint(config) as joint:
+        (device,) = joint._devices
+
+        def do() -> None:
+            if left:
+                device.device[0].drive.mode = Mode.PROFILE_VELOCITY
+            else:
+                joint.plant_states[0].added_load_torque_Nm = -500.0  # it is pushed out of its way
+
+        result = session_of(config, tmp_path / "run.mcap", lambda _: AtTracking(do), allow_low_margin=True).run()
+    assert result is not None
+    assert result.fault_text is not None
+    assert ("6061 (modes of operation display) is 3 after the run, 8 was set" in result.fault_text.happened) is left
+    assert ("changed its mode" in result.fault_text.cause) is left
+    assert result.drive_state in OFF
+
+
+@pytest.mark.parametrize("swapped", [True, False])
+def test_one_yes_is_not_for_a_drive_that_takes_the_place_of_the_first(tmp_path: Path, swapped: bool) -> None:
+    config, control = short(tmp_path, "virtual"), Control(StopSignals())
+    with real_time_joint(config) as joint:
+        for motion in range(2):
+            if swapped and motion:
+                joint._devices[0].device[0].communication.identity[3] = 2
+            session = session_of(config, tmp_path / f"{motion}.mcap", control=control, allow_low_margin=True)
+            another = swapped and motion == 1
+            with pytest.raises(DeviceError, match=r"serial 2; it was .* serial 1") if another else nullcontext():
+                assert session.run() is not None
+            assert session.drive_state in OFF
+    assert (tmp_path / "1.mcap").exists() is not swapped  # nothing has moved
 
 
 # --- the configuration ---

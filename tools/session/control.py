@@ -14,7 +14,8 @@ from types import FrameType
 
 from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
-from jointctl.drivers.errors import MotionFault, UsageError
+from jointctl.drivers.drive import DriveIdentity
+from jointctl.drivers.errors import DeviceError, MotionFault, UsageError
 from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
@@ -47,6 +48,7 @@ class StopSignals:
         self._again = False  # the next signal is no new one
         self.looked_ns: int | None = None  # by `now_ns`; from the user's yes on, which may be for several motions
         self.stood_s = 0.0  # since then, if it was long
+        self.drives: list[str] = []  # those that answered first, by vendor, product and serial number
         self._command = threading.Lock()
 
     @property
@@ -110,6 +112,16 @@ class StopSignals:
                 f"this program or the computer stood still for {self.stood_s:.0f} s after the motion was agreed to",
                 "nothing moves: start again",
             )
+
+    def require_same(self, drives: Sequence[DriveIdentity]) -> None:
+        """`DeviceError` where another drive answers than at a motion before: one yes is for one joint."""
+        found = [f"{drive.vendor} {drive.product} serial {drive.serial}" for drive in drives]
+        if self.drives and found != self.drives:
+            before = ", ".join(self.drives)
+            raise DeviceError(
+                f"another drive answers than before: {', '.join(found)}; it was {before}", "nothing moves: start anew"
+            )
+        self.drives = found
 
     def note_standstill(self) -> None:
         """In any thread."""

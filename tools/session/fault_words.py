@@ -269,6 +269,12 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         follows_pause=True,
     ),
 }
+# what a drive looks like that has left its mode by itself: 6061 is read once a second, and these come sooner
+OF_A_LEFT_MODE = frozenset({
+    Fault.POSITION_FROZEN, Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.POSITION_LIMIT, Fault.TORQUE_SATURATED,
+    Fault.LIMIT_CYCLE, Fault.STOP_TIMEOUT,
+})  # fmt: skip
+LEFT_MODE = "look for the cause in the drive: an input or a program of its own that chooses modes"
 _ENCODER_CURE = "check the encoder's supply, cable and mounting; its manual tells the error code"
 # EMCY classes of CiA 301 with which a drive says that it does not hear this computer as it should
 _COMMUNICATION_ERRORS = (0x8100, 0x8200)

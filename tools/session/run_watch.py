@@ -37,7 +37,7 @@ from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLog
 from jointctl.tools.recording.run_summary import KeptRecords
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Display, EventFinder, Snapshot, phase_name
-from jointctl.tools.session.fault_words import FaultText, NoticeFinder
+from jointctl.tools.session.fault_words import LEFT_MODE, OF_A_LEFT_MODE, FaultText, NoticeFinder
 from jointctl.tools.session.live_changes import LiveChanges, ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import JointPlan, RunPlan
@@ -408,6 +408,13 @@ class RunWatch:
         for text in self.settings_guard.poll(may_ask=may_ask):
             self.log.write_event(WARNING, "drive", text)
             self.display.note(text)
+
+    def mode_explained(self, fault: Fault, text: FaultText) -> FaultText:
+        """The text of a fault with the mode of the drive, which is off, if it has left it."""
+        if fault not in OF_A_LEFT_MODE or self.settings_guard is None or not (left := self.settings_guard.mode_left()):
+            return text
+        self.log.write_event(ERROR, "drive", left)
+        return FaultText(f"{text.happened}; {left}", "the drive, or another program, has changed its mode", LEFT_MODE)
 
     def tell_bus_news(self) -> None:
         """What the controller of the bus has complained about since the last call."""

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from jointctl.drivers.can.socketcan import interface_blamed
-from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
+from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state, is_safe
 from jointctl.drivers.errors import (
     BusError,
     DataError,
@@ -126,6 +126,7 @@ class Session:
                     reports = self.commissioned(config, drives, self._may_brake())
                 except Declined:
                     return None
+                signals.require_same([report.identity for report in reports])
                 signals.leave_if_asked()
                 placed = self._ask(lambda: self._allowed(reports))
                 if placed is None:
@@ -392,6 +393,7 @@ class Session:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
             text = self._kind.fault_text(config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
+            text = watch.mode_explained(fault, text) if is_safe(drive_state) else text
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         summary = summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC)
         return RunResult(

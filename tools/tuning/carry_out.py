@@ -108,6 +108,16 @@ class Carrier:
     allow_low_margin: bool = False
     drive_state: str = ""
 
+    @property
+    def drives(self) -> list[str]:
+        """See `StopSignals.drives`; none in lockstep."""
+        return [] if self.control is None else self.control.signals.drives
+
+    @drives.setter
+    def drives(self, drives: list[str]) -> None:
+        if self.control is not None:
+            self.control.signals.drives = drives
+
     def quietly(self) -> Output:
         """For a part whose result is not that of the command."""
         return replace(self.output, quiet=True, json=False, taken=lambda _: None)

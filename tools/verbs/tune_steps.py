@@ -100,9 +100,8 @@ STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verifi
 STATE, ANEW = "steps.json", "without --resume it begins anew"
 OTHER = "of another drive, or of a simulated joint instead of a real one"
 FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
-MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR,
-                 Fault.POSITION_LIMIT)  # fmt: skip
 OF_GAINS = (Fault.LIMIT_CYCLE, Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
+MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.POSITION_LIMIT, *OF_GAINS[1:])
 SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
           "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
@@ -198,17 +197,17 @@ class Tune:
 
     def _open(self) -> None:
         prepare_folder(self.folder)
-        path, original = self.folder / STATE, self.original
+        path, original, asked = self.folder / STATE, self.original, [self.options.law, self.options.objective]
         about = {
             "configuration": hashlib.sha256(original.text.encode()).hexdigest(),
             "torque_Nm": self.config.limits.torque_max_Nm, "simulated": self.options.lockstep,
             "bus": original.bus.model_dump(mode="json"), "drive": original.drive.model_dump(mode="json"),
         }  # fmt: skip
-        asked = [self.options.law, self.options.objective]
         if self.options.resume:
             try:
                 kept = dict(parse_json(read_input(path)))
                 own = dict(kept.get("about", {}))
+                self.carrier.drives = [str(drive) for drive in kept.get("drives", [])]  # whose steps these are
             except (OSError, ValueError, TypeError) as error:
                 raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}", ANEW) from None
             if about not in (own, {**own, "configuration": kept.get("written")}):
@@ -220,7 +219,8 @@ class Tune:
         self._about: dict[str, Any] = {"about": about, "asked": asked}
 
     def _save(self) -> None:
-        replace_file(self.folder / STATE, json.dumps({**self._about, **self.state}, indent=1).encode())
+        kept = {**self._about, "drives": self.carrier.drives, **self.state}
+        replace_file(self.folder / STATE, json.dumps(kept, indent=1).encode())
 
     # --- 1. direction and counts ---
 
@@ -532,19 +532,18 @@ class Tune:
         return self.config.model_copy(update={"control": self.original.control, "joint_encoder": second})
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
-        seconds = self.verifying.duration_s
         moving = with_motion(config, self.verifying)
         motion = ConfiguredMotion(moving, trajectory_table(moving))
         carried = self.carrier.run(moving, motion, title, also_faults=() if title == "verification" else OF_GAINS)
         rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
-        rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * seconds)]
+        rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * self.verifying.duration_s)]
         if carried.text is not None or not len(rows):
             return {"fault": carried.fault.name}
         error = 1e3 * np.asarray(rows.error_rad)
         return {
             "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
-            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "seconds": seconds,
-            "log": carried.log,
+            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "log": carried.log,
+            "seconds": self.verifying.duration_s,
         }  # fmt: skip
 
     # --- 8. refinement ---

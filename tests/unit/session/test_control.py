@@ -584,6 +584,7 @@ def test_what_a_stop_did_to_the_drive_is_no_fault_in_the_table_either(commanded_
         stopped_by="jointctl stop",
         log=SimpleNamespace(is_in_place=lambda: True),
         temperature=SimpleNamespace(values_degC=[]),
+        mode_explained=lambda fault, text: text,
         joint=SimpleNamespace(log_path=Path("x.mcap"), name=""),
         around=SimpleNamespace(
             signals=SimpleNamespace(commanded_ns=commanded_ns),

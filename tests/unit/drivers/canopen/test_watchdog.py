@@ -395,6 +395,20 @@ def test_a_change_is_named(run: Run, index: int, confirmed: bool) -> None:
         run.polled(40)
 
 
+@pytest.mark.parametrize(
+    ("answer", "silent", "words"),
+    [
+        (2, False, "node 1: 6061 (modes of operation display) is 2 after the run, 10 was set"),
+        (10, False, ""),
+        (2, True, ""),
+    ],
+)
+def test_after_the_run_the_mode_is_read_once(run: Run, answer: int, silent: bool, words: str) -> None:
+    run.bus.answers[0x6061, 0] = answer
+    run.bus.mute += [(0x6061, 0)] * 10 * silent
+    assert run.guard.mode_left() == words
+
+
 def test_a_command_of_another_controller_is_seen_at_once(run: Run) -> None:
     run.bus.send(0x000, bytes([128, 1]))
     with pytest.raises(BusError, match="NMT 'enter pre operational' to node 1"):
