@@ -422,9 +422,13 @@ def set_sync(objects: ObjectAccess, rate_Hz: float, *, cyclic: bool) -> dict[str
     listen_to_our_sync(objects, rate_Hz)
     if not cyclic and not (objects.has(0x60C2, 1) and objects.has(0x60C2, 2)):
         return {}
+    names = {1: "interpolation time period", 2: "interpolation time index"}
     value, exponent = interpolation_period(rate_Hz)
-    objects.write_verified(0x60C2, 1, value, what="interpolation time period")
-    objects.write_verified(0x60C2, 2, exponent, what="interpolation time index")
+    held, held_exponent = (objects.read(0x60C2, sub, what=what) for sub, what in names.items())
+    if held_exponent != exponent and math.isclose(held * 10.0**held_exponent, 1.0 / rate_Hz):  # as 10 x 10^-4 s
+        return {"60C2": f"{held}e{held_exponent} s"}
+    objects.write_verified(0x60C2, 1, value, what=names[1])
+    objects.write_verified(0x60C2, 2, exponent, what=names[2])
     return {"60C2": f"{value}e{exponent} s"}
 
 

@@ -354,7 +354,11 @@ def _use_as_it_is(objects: ObjectAccess, pdo: PdoMap, kind: int) -> PdoMap:
             hint=f"set drive.rpdo_transmission_type = {found_kind}, so that the delay of the loop is known",
         )
     if pdo.cob_id & EXTENDED or not FIRST_IDENTIFIER <= pdo.identifier <= LAST_IDENTIFIER:
-        raise DeviceError(f"{what} cannot be changed and has COB-ID {pdo.cob_id:08X}h, which is no PDO's", FIXED_HINT)
+        raise DeviceError(
+            f"the map of {what} cannot be changed, and its COB-ID {pdo.cob_id:08X}h is no PDO's",
+            hint=f"write an identifier that nothing else uses, {FIRST_IDENTIFIER:X}h to {LAST_IDENTIFIER:X}h, to "
+            f"{pdo.base:04X}:1 with the drive maker's software; or {FIXED_HINT}",
+        )
     objects.write_verified(pdo.base, 1, pdo.cob_id & ~DISABLED, what=f"{what} COB-ID")
     return pdo
 

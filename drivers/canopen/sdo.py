@@ -108,6 +108,14 @@ def object_name(index: int, sub: int = 0) -> str:
     return f"{index:04X}:{sub}" if sub else f"{index:04X}"
 
 
+def visible_string(data: bytes) -> str:
+    """A VISIBLE_STRING such as 1008; what makers write beyond its ASCII is UTF-8, else Latin-1."""
+    try:
+        return data.rstrip(b"\0").decode()
+    except UnicodeDecodeError:
+        return data.rstrip(b"\0").decode("latin-1")
+
+
 def value_text(index: int, sub: int, value: int) -> str:
     """As it is read: COB-IDs, and objects that are mapped into a PDO, in hexadecimal."""
     cob_id = index == 0x1005 or (sub == 1 and (0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00))
@@ -168,7 +176,8 @@ class ObjectAccess:
         if variable is None:
             raise DeviceError(
                 f"EDS {self._eds_name} has no object {object_name(index, sub)} ({what}), which jointctl needs",
-                hint="if that is the file of this drive and firmware, jointctl cannot drive it (docs/drives)",
+                hint="if that is the file of this drive and firmware, jointctl cannot drive it in this drive.mode "
+                "(docs/drives)",
             )
         return variable
 
@@ -330,7 +339,7 @@ class ObjectAccess:
         if self._variable(index, 0) is None:
             return ""
         try:
-            return bytes(self._node.sdo.upload(index, 0)).rstrip(b"\0").decode("latin-1").strip()
+            return visible_string(bytes(self._node.sdo.upload(index, 0))).strip()
         except (SdoAbortedError, SdoCommunicationError, struct.error):  # the last: an answer that is too short
             return ""
 

@@ -26,7 +26,8 @@ from jointctl.tools.session.fault_words import emergency_text
 
 HISTORY = 8  # entries of 1003 that are shown
 CONSUMERS = 4  # entries of 1016
-PDO_NUMBERS = 4
+PDO_NUMBERS = 4  # that are read where no EDS lists others
+ALL_PDOS = frozenset(range(0x200))
 MILLI = 1e-3
 MAXON = 0xFB  # vendor of 1018:1
 
@@ -155,7 +156,8 @@ def pdo_maps(reader: SdoReader, maps: PdoMaps | None = None) -> list[PdoMap]:
     """The PDOs as they are set up in the drive; also taught to `maps`."""
     maps = PdoMaps() if maps is None else maps
     for communication, mapping in ((0x1800, 0x1A00), (0x1400, 0x1600)):
-        for number in range(PDO_NUMBERS):
+        listed = {index - communication for index in reader.objects.dictionary or ()}
+        for number in sorted({*range(PDO_NUMBERS), *(listed & ALL_PDOS)}):
             cob_id = reader.value(communication + number, 1)
             if cob_id is None:
                 continue

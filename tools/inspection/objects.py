@@ -13,7 +13,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from jointctl.drivers.canopen.cia import LAST_SYNCHRONOUS, SUPPORTED_MODE_BIT, Mode, NmtCommand, NmtState, state_text
 from jointctl.drivers.canopen.eds import read_eds
-from jointctl.drivers.canopen.sdo import object_name
+from jointctl.drivers.canopen.sdo import object_name, visible_string
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import require_input
 from jointctl.tools.session.fault_words import emergency_text
@@ -286,7 +286,7 @@ class Objects:
         variable = self.variable(index, sub)
         kind = None if variable is None else variable.data_type
         if kind in TEXTS:
-            return data.rstrip(b"\0").decode("latin-1")
+            return visible_string(data)
         if kind in INTEGERS:
             return int.from_bytes(data, "little", signed=kind in SIGNED)
         if kind in datatypes.FLOAT_TYPES and len(data) in (4, 8):

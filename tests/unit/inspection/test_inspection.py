@@ -6,6 +6,7 @@ import json
 import re
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -205,6 +206,19 @@ class TestInfo:
             assert refusal.absent
             assert "06020000h Object does not exist" in str(refusal)
             assert len(pdo_maps(reader)) == 8
+
+    def test_a_pdo_beyond_the_fourth_is_shown_where_the_eds_lists_it(self) -> None:
+        held = {(0x1404, 1): 0x205, (0x1404, 2): 1, (0x1604, 0): 1, (0x1604, 1): 0x60400010}
+        reader: Any = SimpleNamespace(node=1, value=lambda index, sub=0: held.get((index, sub)))
+        reader.objects = Objects(dict.fromkeys((0x1000, 0x1404, 0x1604)))  # type: ignore[arg-type]
+        (found,) = pdo_maps(reader)
+        assert (found.name, found.cob_id, found.enabled) == ("RPDO5", 0x205, True)
+        reader.objects = Objects()
+        assert pdo_maps(reader) == []
+
+    @pytest.mark.parametrize("data", ["Müller".encode(), "Müller".encode("latin-1") + b"\0"])
+    def test_a_name_beyond_ascii(self, data: bytes) -> None:
+        assert Objects().value(0x1008, 0, data) == "Müller"
 
 
 class TestMonitor:

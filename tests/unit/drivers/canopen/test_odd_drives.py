@@ -231,6 +231,16 @@ def test_an_object_that_cannot_be_written_but_holds_the_value(commission: Any, j
         commission(rate_Hz=500.0)
 
 
+def test_a_period_that_cannot_be_written_may_hold_it_in_other_numbers(commission: Any, joint: Any) -> None:
+    joint.refused[(0x60C2, 1)] = joint.refused[(0x60C2, 2)] = READ_ONLY
+    joint.store(0x60C2, 1, 10)
+    joint.store(0x60C2, 2, -4)
+    assert commission().settings["60C2"] == "10e-4 s"
+    joint.store(0x60C2, 1, 11)
+    with pytest.raises(DeviceError, match=r"60C2:1 .* was refused: object is read only"):
+        commission()
+
+
 # --- torque mode with a slope ---
 @pytest.mark.parametrize("rate_Nmps", [1209.0, 1211.0])
 def test_a_torque_slope_that_the_drive_limits_is_used_where_the_loop_is_slower(
