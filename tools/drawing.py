@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 from jointctl.drivers.errors import UsageError, printable
-from jointctl.tools.written_file import refuse_overwriting, refuse_special, replace_file, writing
+from jointctl.tools.written_file import refuse_overwriting, refuse_unwritable, replace_file, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,7 +145,7 @@ def require_png(path: Path, inputs: Iterable[Path]) -> None:
     if path.suffix.lower() != ".png":
         raise UsageError(f"--figure (={path}) must end in .png")
     refuse_overwriting(path, inputs)
-    refuse_special(path)
+    refuse_unwritable(path)
 
 
 def save_png(figure: Figure, path: Path) -> Path:

@@ -69,10 +69,19 @@ def refuse_read_only(path: Path) -> None:
         raise DataError(f"{path}: cannot be written: no permission")
 
 
-def require_target(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """As `refuse_overwriting` and `refuse_special`; `DataError` too if its folder is not there."""
-    refuse_overwriting(path, inputs)
+def refuse_unwritable(path: Path) -> None:
+    """As `refuse_special` and `refuse_read_only`; `DataError` too where its folder takes no file (missing: is made)."""
     refuse_special(path)
+    refuse_read_only(path)
+    folder = next(parent for parent in path.absolute().parents if os.path.isdir(parent))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise DataError(f"{path}: cannot be written: no permission in {folder}")
+
+
+def require_target(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """As `refuse_overwriting` and `refuse_unwritable`; `DataError` too if its folder is not there."""
+    refuse_overwriting(path, inputs)
+    refuse_unwritable(path)
     if not os.path.isdir(path.parent):
         raise DataError(f"{path}: cannot be written: no folder {path.parent}")
 
@@ -91,10 +100,10 @@ def prepare_target(file: Path | None) -> None:
     """As `prepare_folder` for the folder of a file; `DataError` if the name is that of a folder.  None: nothing."""
     if file is None:
         return
+    refuse_unwritable(file)
     prepare_folder(file.parent)
     if os.path.isdir(file):
         raise DataError(f"{file}: is a folder, not a file to write")
-    refuse_special(file)
 
 
 def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:

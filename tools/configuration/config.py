@@ -42,6 +42,7 @@ from jointctl.tools.configuration.sections import (
     numbers,
     whole_channel,
 )
+from jointctl.tools.written_file import refuse_unwritable
 
 # --- Section [control] with [control.learning] and [control.adaptation]: the law and its gains; docs/law.md ---
 
@@ -198,12 +199,13 @@ def first_on_bus(joints: Iterable[Config]) -> list[int]:
 
 
 def refuse_shipped(config: Config) -> None:
-    """`ConfigurationError` for a file that is to be written into and came with jointctl."""
+    """Of a file that is to be written: `ConfigurationError` if it came with jointctl, `DataError` if it cannot be."""
     if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
         raise ConfigurationError(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
+    refuse_unwritable(config.path)
 
 
 def beside(config_path: Path, name: str) -> Path:

@@ -24,7 +24,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.drawing import save_png
+from jointctl.tools.drawing import require_png, save_png
 from jointctl.tools.experiments.campaign import write_json
 from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, StudySettings, write_csv
 from jointctl.tools.experiments.scenarios import ErrorFigures
@@ -433,6 +433,21 @@ def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path, kind: str) -> No
             refused(path)
     after = os.stat(path)
     assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
+
+
+@pytest.mark.parametrize("refused", [require_target, prepare_target, lambda path: require_png(path, ())])
+@pytest.mark.parametrize("place", ["file", "folder"])
+def test_what_the_modes_protect_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any, place: str
+) -> None:
+    """A response or a map of minutes was lost where its picture could not be written."""
+    path = tmp_path / "out.png"
+    path.write_bytes(b"before")
+    refused(path)  # its twin
+    protected = path if place == "file" else tmp_path
+    monkeypatch.setattr(os, "access", lambda asked, mode: Path(asked) != protected)
+    with pytest.raises(DataError, match=r"out\.png: cannot be written: no permission"):
+        refused(path)
 
 
 PLANTS = (PlantResult(0, "lugre", 17, (ErrorFigures(*(0.0 for _ in fields(ErrorFigures))),)),) * 500
