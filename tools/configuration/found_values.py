@@ -16,7 +16,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config, ConfigurationProblems
-from jointctl.tools.configuration.load import load_config, read_text
+from jointctl.tools.configuration.load import RENAMED, load_config, read_text
 from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer
 from jointctl.tools.written_file import replace_file
 
@@ -218,6 +218,9 @@ def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]])
                 table[name] = tomlkit.table()
                 inserted.add(".".join(one.section))
             table = table[name]
+        for old, new in RENAMED.get(".".join(one.section), {}).items():
+            if new == one.key:
+                table.pop(old, None)  # both are refused
         if one.value is None:
             table.pop(one.key, None)
         elif not (one.key in table and table[one.key] == one.value):

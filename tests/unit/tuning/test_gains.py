@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from jointctl.tools.analysis.linear_loop import Encoders, LoopSettings, TwoMasse
 from jointctl.tools.analysis.margins import learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.tuning.carry_out import with_slow_observer
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
@@ -374,3 +376,13 @@ def test_a_section_that_is_put_between_others_stands_apart() -> None:
         "[control]\nkp = 3.0\n\n[log]\nkeep = 2\n", [Found(("control", "adaptation"), "reach", 0.3, "")], {}
     )
     assert text == "[control]\nkp = 3.0\n\n[control.adaptation]\nreach = 0.3\n\n[log]\nkeep = 2\n"
+
+
+def test_a_value_that_stands_under_its_old_name_is_not_written_beside_it(tmp_path: Path) -> None:
+    """Both are refused, after all of a tune's motion."""
+    path = tmp_path / "older.toml"
+    text = shipped_config("virtual").read_text().replace("\nlyapunov_q =", "\nq =")
+    path.write_text(with_tuned(text, [Found(("control",), "lyapunov_q", 3.0, "")], {}))
+    config = load_config(path)
+    assert config.control.lyapunov_q == (3.0,)
+    assert not config.remarks
