@@ -50,6 +50,7 @@ LATEST_s = 0.012  # of delay and of lag, at most
 # tests/bench/tune_ensemble.py
 MODEL_SHARES = {"inertia_kgm2": 0.025, "link_kgm2": 0.025, "stiffness_Nmprad": 0.09, "resonance_Hz": 0.05}
 MODEL_LATE_s = 1e-4
+RIGID_SPLIT_s = 2.5e-4  # the same of delay and of lag, each by itself, where no resonance tells them apart
 UNSEEN_LATE_s = 6e-4  # the same where the link's encoder is alone: there is no antiresonance to tell a loss from delay
 # besides, for each rad/s^2 by which the friction over the inertia is more than `LITTLE_radps2`; `--light` there
 LITTLE_radps2, MOST_radps2, FRICTION_SHARE, FRICTION_LATE_s = 5.0, 85.0, 4.5e-3, 5.5e-6
@@ -345,6 +346,8 @@ def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
     for name, value, own in zip(_VALUES, centre, half, strict=True):
         late_s = MODEL_LATE_s if model.tells_link else UNSEEN_LATE_s
         besides = late_s if name in ("delay_s", "lag_s", "late_s") else MODEL_SHARES.get(name, 0.0) * value
+        if name in ("delay_s", "lag_s") and not model.flexible:
+            besides = max(besides, RIGID_SPLIT_s)
         found[name] = Estimate(float(value), math.hypot(own, besides))
     return found
 

@@ -553,3 +553,12 @@ def test_a_stage_whose_log_could_not_be_written_is_not_moved_once_more() -> None
     with pytest.raises(DataError, match="No space left"):
         carry_out._stage(response_task(shipped("precise"), None, AS_IT_FITS.legs), carrier, 1.0, 2)
     assert len(runs) == 1
+
+
+def test_what_tells_delay_and_lag_apart_is_a_resonance() -> None:
+    """Of 10 rigid joints in lockstep 3 lags and 2 delays were outside intervals as narrow as those of soft joints."""
+    late = (1.3e-3, 0.6e-3)
+    rigid, soft = fit_joint(made_response(RIGID, late, motor=False), 1.0), fit_joint(made_response(SOFT, late), 2.0)
+    for name in ("delay_s", "lag_s"):
+        assert rigid.values[name].half >= 2.5e-4 > 1.5 * soft.values[name].half
+    assert rigid.late_s.half < 1.5e-4
