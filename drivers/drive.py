@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from jointctl.drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError, JointctlError
 from jointctl.firmware_py.kernel import kernel
 
 T = TypeVar("T")
@@ -190,23 +191,43 @@ class DriveGroup:
     earlier run has left enabled.  None takes part in the cyclic exchange before all were verified.
     """
 
-    def __init__(self, drives: Sequence[Drive], buses: Sequence[int] = ()) -> None:
-        """`buses`: of each drive the number of the first one on the same bus; none: all are on one."""
+    def __init__(self, drives: Sequence[Drive], buses: Sequence[int] = (), names: Sequence[str] = ()) -> None:
+        """`buses`: of each drive the number of the first one on the same bus; none: all are on one.
+
+        `names`: of each drive what stands before its errors, as the file of its joint.
+        """
         self.drives, self._buses = tuple(drives), buses
+        self._names = names or [""] * len(drives)
         self._parts = [d for d in drives if isinstance(d, DriveOfArm)] if len(drives) > 1 else []
 
     def commission(self, approve: Approval | None = None) -> list[CommissioningReport]:
         """`Drive.commission` of each; all are left disabled."""
         for part in self._parts:
-            part.take_over(approve)
-        return [drive.commission(approve) for drive in self.drives]
+            with self._named(part):
+                part.take_over(approve)
+        reports = []
+        for drive in self.drives:
+            with self._named(drive):
+                reports.append(drive.commission(approve))
+        return reports
 
     def start_cyclic(self) -> None:
         """`Drive.start_cyclic` of each."""
         for part in self._parts:
-            part.verify()
+            with self._named(part):
+                part.verify()
         for drive in self.drives:
-            drive.start_cyclic()
+            with self._named(drive):
+                drive.start_cyclic()
+
+    @contextmanager
+    def _named(self, drive: object) -> Iterator[None]:
+        try:
+            yield
+        except JointctlError as error:
+            name = self._names[self.drives.index(drive)]
+            error.message = f"{name}: {error.message}" if name else error.message
+            raise
 
     def port(self) -> Any:
         """The record arrays of all as one."""

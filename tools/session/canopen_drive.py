@@ -75,7 +75,7 @@ class CanopenSession(SessionDrive):
                 stack.callback(first.close)
                 drives.append(first)
             stack.pop_all()
-        return DriveGroup(drives, buses)
+        return DriveGroup(drives, buses, [config.path.name for config in configs])
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
         kind, rate_Hz = canopen_section(config).rpdo_transmission_type, config.loop.rate_Hz

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -91,6 +92,19 @@ def arm(settings_of_virtual_joint: CanopenSettings) -> Iterator[Arm]:
         group = DriveGroup([first, *others])
         yield Arm(bus, drives, group)
         group.close()
+
+
+@pytest.mark.parametrize("names", [["a.toml", "b.toml"], []])
+def test_a_refusal_names_the_joint_whose_drive_it_is(
+    arm: Arm, monkeypatch: pytest.MonkeyPatch, names: list[str]
+) -> None:
+    first, second = arm.group.drives[:2]
+    refusal = Mock(side_effect=DeviceError("drive.rated_torque_Nm (=0.9) does not agree", "correct it"))
+    monkeypatch.setattr(second, "commission", refusal)
+    with pytest.raises(DeviceError) as refused:
+        DriveGroup([first, second], names=names).commission()
+    assert refused.value.message == f"{'b.toml: ' if names else ''}drive.rated_torque_Nm (=0.9) does not agree"
+    assert refused.value.hint == "correct it"
 
 
 def test_each_drive_is_commissioned_and_its_watchdog_proven(arm: Arm) -> None:
