@@ -65,14 +65,7 @@ from jointctl.firmware_py.states import (
     Reaction,
     TrajectoryKind,
 )
-from jointctl.firmware_py.trajectory import (
-    NO_REPETITION,
-    Repetition,
-    approach_at,
-    brake_step,
-    reference_at,
-    repetition,
-)
+from jointctl.firmware_py.trajectory import NO_REPETITION, Repetition, approach_at, brake_step, reference_at, repetition
 
 # --- One tick of one joint: sample in, command out ---
 # position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
@@ -190,13 +183,7 @@ def law_torque_Nm(constants: AxisConstants, state: AxisState, reference: Referen
         reading = Reading(state.measured_position_rad, state.second_position_rad, state.gap_cycles)
         return step_flexible_law(constants.law, state.law, reading, reference, state.command_torque_Nm, where)
     return step_law(
-        constants.law,
-        state.law,
-        state.measured_position_rad,
-        state.velocity,
-        reference,
-        state.command_torque_Nm,
-        where,
+        constants.law, state.law, state.measured_position_rad, state.velocity, reference, state.command_torque_Nm, where
     )
 
 

@@ -40,13 +40,7 @@ from jointctl.hil.bus_timing import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of,
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
-from jointctl.hil.faults import (
-    append_frame,
-    fault_rows,
-    pass_frame,
-    step_faults,
-    take_due,
-)
+from jointctl.hil.faults import append_frame, fault_rows, pass_frame, step_faults, take_due
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 ENETDOWN = errno_codes.ENETDOWN

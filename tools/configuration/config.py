@@ -84,9 +84,8 @@ class Adaptation(Section):
     reach: Annotated[float, between(0.0, 1.0)] = 0.3
     # torque ripple to find: periods a motor turn, two at most
     ripple_per_motor_turn: Annotated[tuple[float, ...], numbers("numbers", 0, 1, RIPPLES, low=0.0, high=1000.0)] = ()
-    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = (
-        0.7  # expected of it, at the joint; four times at most
-    )
+    # expected of it, at the joint; four times at most
+    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = 0.7
 
 
 class Control(Section):
@@ -106,9 +105,8 @@ class Control(Section):
     learning_rate: Annotated[float, between(0.0, 1e9)]  # of the network's weights
     initial_weight_Nm: Annotated[float, between(-1000.0, 1000.0)]  # of each of the 15 neurons
     widths: Annotated[tuple[float, ...], numbers("widths", 1, NEURONS, low=0.0, high=1e4)]  # of the Gaussians
-    centres: Annotated[tuple[tuple[float, float], ...], BeforeValidator(Rule(CENTRES, _centres))] | None = (
-        None  # none = the paper's
-    )
+    # none = the paper's
+    centres: Annotated[tuple[tuple[float, float], ...], BeforeValidator(Rule(CENTRES, _centres))] | None = None
     leakage_1ps: Annotated[float, between(0.0, 100.0)] = 0.0  # pulls the weights to zero: bounded under noise
     weight_limit_Nm: Annotated[float, between(0.0, 1e6)] = 0.0  # of each weight; 0 = none
     dead_zone_rad: Annotated[float, between(0.0, 1.0)] = 0.0  # no learning at smaller errors

@@ -60,9 +60,8 @@ class ElmoSection(DriveSection):
     speed_error_radps: Annotated[float, between(0.0, 1000.0, open_low=True)]  # ER[2], at the joint
     position_error_rad: Annotated[float, between(0.0, 10.0, open_low=True)]  # ER[3], at the joint
     dead_man_s: Annotated[float, between(0.0, 0.5, open_low=True)] = 0.05  # torque zero after so long without position
-    counts_parameter: Annotated[str, AfterValidator(Rule(COUNTS_PARAMETER_TEXT, _counts_parameter))] | None = (
-        None  # compared with counts_per_turn
-    )
+    # compared with counts_per_turn
+    counts_parameter: Annotated[str, AfterValidator(Rule(COUNTS_PARAMETER_TEXT, _counts_parameter))] | None = None
     _unit_mode: UnitModeChoice = PrivateAttr("torque")
 
     when_the_loop_ends: ClassVar[str] = "a serial drive does not notice that: it has been commanded to switch off"

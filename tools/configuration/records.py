@@ -68,9 +68,8 @@ HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as
 MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
 NOISE_S = 0.25  # that the mean change of the torque command is taken over
-NOISE_OF_RATE = (
-    0.6  # share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
-)
+# share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
+NOISE_OF_RATE = 0.6
 FOLLOWING_SHARE = 0.3  # of the torque limit, that goes at most into the kinematic error of a reducer
 RIPPLE_MOST = 4.0  # of what the adaptation takes for torque ripple, times what is expected
 WARMING_S = 2.0  # in which the friction feed-forward follows a new reading of the temperature

@@ -195,9 +195,8 @@ class Sequence(Section):
     brake_radps2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of a controlled stop
     release_s: Annotated[float, between(0.0, 60.0)]  # torque to zero at standstill
     settle_s: Annotated[float, between(0.0, 10.0, open_low=True)]  # good samples in a row before enabling
-    wait_timeout_s: Annotated[
-        float, between(0.0, 600.0, open_low=True)
-    ]  # for the first good samples; as long a silence of the supervisor
+    # for the first good samples; as long a silence of the supervisor
+    wait_timeout_s: Annotated[float, between(0.0, 600.0, open_low=True)]
     # for the drive to switch on, its brake included
     enable_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]
     stop_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]  # for a stop, then the power goes
@@ -293,9 +292,8 @@ class Margin(Section):
     """What `check` computes with, and below what `run` refuses to enable."""
 
     min_phase_margin_deg: Annotated[float, between(0.0, 90.0)] = 20.0  # run refuses to enable below it
-    loop_delay_s: Annotated[float, between(0.0, 0.1)] | None = (
-        None  # from the position sample to the torque; none = from the RPDO type
-    )
+    # from the position sample to the torque; none = from the RPDO type
+    loop_delay_s: Annotated[float, between(0.0, 0.1)] | None = None
     current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005  # of the drive's current loop, first order
     # with [reducer]: the loop must bear these factors on the link's inertia, lightest and heaviest
     payload_range: Annotated[tuple[float, ...], numbers("factors", 2, low=0.0, high=100.0)] = (0.7, 1.4)
@@ -380,9 +378,8 @@ class JointEncoder(Section):
     law: Literal["encoder", "joint_encoder"] = "joint_encoder"  # which of the two feeds the law
     limits: Literal["encoder", "joint_encoder", "both"] = "both"  # which one the position limits are checked with
     disagreement_max_rad: Annotated[float, between(0.0, 1.0, open_low=True)]  # between the two, at the joint
-    stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = (
-        None  # of the reducer between them: torque / stiffness is allowed in addition
-    )
+    # of the reducer between them: torque / stiffness is allowed in addition
+    stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = None
 
 
 # --- [reducer]: of a joint that is not rigid ---

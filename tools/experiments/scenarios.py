@@ -246,9 +246,8 @@ class ErrorFigures:
     settled_share: float | None = None
     stuck_share: float | None = None  # of creep: share of the time in which the joint stands still
     stuck_later_share: float | None = None  # the same from `TURNED_S` after a turn on
-    phase_margin_deg: float | None = (
-        None  # of the loop that is believed, with the joint's true delay where that is known
-    )
+    # of the loop that is believed, with the joint's true delay where that is known
+    phase_margin_deg: float | None = None
 
 
 FAILED = (math.inf, math.inf, -math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)

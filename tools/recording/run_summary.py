@@ -100,10 +100,7 @@ class RunSummary:
 
 
 def summarise(
-    records: np.ndarray,
-    histograms: np.ndarray | None = None,
-    *,
-    temperatures_degC: Sequence[float] | np.ndarray = (),
+    records: np.ndarray, histograms: np.ndarray | None = None, *, temperatures_degC: Sequence[float] | np.ndarray = ()
 ) -> RunSummary:
     """Summary of `records` (array of LogRecord, shape (N,)).
 

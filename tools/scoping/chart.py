@@ -56,12 +56,7 @@ _SAVE_PNG = """(() => {
   link.click()
 })()"""
 _BEHIND, _DARK_BEHIND = "#ffffff", "#121212"
-_AXIS = {
-    "type": "value",
-    "scale": True,
-    "axisLine": {"onZero": False},
-    "nameTextStyle": {"fontSize": 12},
-}
+_AXIS = {"type": "value", "scale": True, "axisLine": {"onZero": False}, "nameTextStyle": {"fontSize": 12}}
 _POWERS = {":formatter": "value => value.toExponential(0)"}  # of ten, as the ticks of a spectrum
 
 

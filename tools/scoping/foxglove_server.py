@@ -46,10 +46,7 @@ MOST_CLIENTS = 32  # in one report
 CLOSED = "{} can be changed only where --allow-remote was given at the bench"
 _KEYS = ("position_rad", "velocity_radps", "acceleration_radps2", "torque_Nm", "time_s")
 _TRIGGER = "std_srvs/srv/Trigger"
-_ANSWER = {
-    "type": "object",
-    "properties": {"success": {"type": "boolean"}, "message": {"type": "string"}},
-}
+_ANSWER = {"type": "object", "properties": {"success": {"type": "boolean"}, "message": {"type": "string"}}}
 
 
 def client_name(number: int) -> str:

@@ -28,13 +28,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.scoping.feed import ScopeFeed, in_time, now_s, require_free, server_process
-from jointctl.tools.scoping.remote_options import (
-    LISTEN_AT,
-    ObserveOptions,
-    RemoteOptions,
-    check_remote,
-    foxglove_place,
-)
+from jointctl.tools.scoping.remote_options import LISTEN_AT, ObserveOptions, RemoteOptions, check_remote, foxglove_place
 from jointctl.tools.session.display import LONGEST_BYTES, Display, Displays, decoded
 from jointctl.tools.session.plan import Consent
 from jointctl.tools.session.result import run_title

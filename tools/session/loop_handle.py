@@ -231,14 +231,8 @@ class LoopHandle:
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run
             with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it
                 self._process.wait(KILL_S)
-            raise MotionFault(
-                f"the loop process did nothing for {silent_s:.1f} s and was ended",
-                self._after_end,
-            )
+            raise MotionFault(f"the loop process did nothing for {silent_s:.1f} s and was ended", self._after_end)
         if self.block.words[Word.ENDED]:
             return False
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
-        raise MotionFault(
-            f"the loop process {how}",
-            self._after_end,
-        )
+        raise MotionFault(f"the loop process {how}", self._after_end)

@@ -225,11 +225,7 @@ def throw_away(bus: FrameBus) -> None:
 
 
 def run_portable_loop(
-    bus: FrameBus,
-    block: SharedBlock,
-    period_ns: int,
-    receive_ns: int,
-    max_cycles: int = FOREVER,
+    bus: FrameBus, block: SharedBlock, period_ns: int, receive_ns: int, max_cycles: int = FOREVER
 ) -> int:
     """The compiled loop's `run_cycles` in plain Python on a python-can bus: until FINISHED or `max_cycles` slots.
 

@@ -239,9 +239,7 @@ class Session:
                 orders: list[ViewerRequest] = []
                 for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
                     metadata = run_metadata(joint.config, report)
-                    if (
-                        plan.arm is not None
-                    ):  # its [motion] is what the joint does, and not the joint's own [trajectory]
+                    if plan.arm is not None:  # its [motion] is what the joint does, not the joint's own [trajectory]
                         arm = plan.arm.config
                         metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
                     if plan.log_every > 1:

@@ -195,10 +195,7 @@ class SweepMeter:
     """`feed` it every log record in order; `on_point` is called as soon as the last window of a point is over."""
 
     def __init__(
-        self,
-        windows: tuple[Window, ...],
-        model: JointModel,
-        on_point: Callable[[MeasuredPoint], None],
+        self, windows: tuple[Window, ...], model: JointModel, on_point: Callable[[MeasuredPoint], None]
     ) -> None:
         self._windows = windows
         self._model = model

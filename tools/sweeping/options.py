@@ -193,8 +193,7 @@ class SweepOptions:
     assume_yes: Annotated[bool, typer.Option("-y", "--yes", help="move without asking")] = False
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
     allow_low_margin: Annotated[
-        bool,
-        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
+        bool, typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin")
     ] = False
     report: Annotated[
         Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")

@@ -431,10 +431,7 @@ def constant_remarks(config: Config) -> list[str]:
 
 def recorded_limits(config: Config) -> dict[str, float]:
     """For the sidecar: what `identify` compares the data with when no configuration is at hand; at the joint."""
-    return {
-        "torque_max_Nm": config.limits.torque_max_Nm,
-        "velocity_max_radps": config.limits.velocity_max_radps,
-    }
+    return {"torque_max_Nm": config.limits.torque_max_Nm, "velocity_max_radps": config.limits.velocity_max_radps}
 
 
 def measuring_constants(config: Config) -> dict[str, float]:

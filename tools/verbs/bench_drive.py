@@ -49,9 +49,7 @@ class Asked:
 MaybeConfig = Annotated[
     Path | None,
     typer.Argument(
-        metavar="[CONFIG]",
-        help="configuration; without it give the bus by -i and -c",
-        autocompletion=configurations,
+        metavar="[CONFIG]", help="configuration; without it give the bus by -i and -c", autocompletion=configurations
     ),
 ]
 Eds = Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the node; default: the configuration's")]

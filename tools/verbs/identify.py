@@ -347,12 +347,7 @@ def _from_plateaus(
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
     """The motion of a run log or of a table, with those of `settings.also` after it."""
     from jointctl.tools.identification.friction_data import refuse_unused
-    from jointctl.tools.identification.motion_data import (
-        is_series,
-        joined,
-        motion_of_log,
-        motion_of_plateaus,
-    )
+    from jointctl.tools.identification.motion_data import is_series, joined, motion_of_log, motion_of_plateaus
     from jointctl.tools.identification.motion_table import read_motion
     from jointctl.tools.recording.run_log_reader import read_run_log
 

@@ -62,13 +62,7 @@ EPILOG = (
     "shipped one: virtual, precise, paper, realistic, csp, sweep_virtual, elmo_gold_can, elmo_serial."
 )
 
-app = typer.Typer(
-    name="jointctl",
-    cls=Verbs,
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="jointctl", cls=Verbs, no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False)
 
 
 def _version(wanted: bool) -> None:

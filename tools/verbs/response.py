@@ -72,13 +72,7 @@ def response(
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.session.result import never_begun, require_off
-    from jointctl.tools.tuning.carry_out import (
-        Carrier,
-        NotCarriedOut,
-        ShownConsent,
-        response_by_any_law,
-        response_task,
-    )
+    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, ShownConsent, response_by_any_law, response_task
     from jointctl.tools.tuning.frequency_response import bode_figure
     from jointctl.tools.tuning.joint_fit import fit_of
     from jointctl.tools.written_file import replace_file, require_target

@@ -269,8 +269,7 @@ class Sweep:
         kept = f"{points} in {self.out}" if done else "nothing was measured"
         kind = LimitCycle if fault is Fault.LIMIT_CYCLE else MotionFault
         raise kind(
-            f"{fault.name} ({int(fault)}): {text.happened}; {kept}",
-            text.advice + ("; then --resume" if done else ""),
+            f"{fault.name} ({int(fault)}): {text.happened}; {kept}", text.advice + ("; then --resume" if done else "")
         )
 
     def _report(self, stopped: str | None) -> int:

@@ -29,12 +29,7 @@ from jointctl.drivers.errors import (
 )
 from jointctl.firmware_py.input_file import parse_json, read_input
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.tools.analysis.gains import (
-    ChosenGains,
-    apart,
-    choose_gains,
-    require_encoders,
-)
+from jointctl.tools.analysis.gains import ChosenGains, apart, choose_gains, require_encoders
 from jointctl.tools.analysis.linear_loop import loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.reducer_map import FoundMap, found_map

@@ -348,10 +348,7 @@ def _taking(made: Callable[[dict[str, Any]], Output], taken: Taker | None) -> Ca
 
 
 def _collect(
-    function: Callable[..., Any],
-    options: list[inspect.Parameter],
-    last: list[inspect.Parameter],
-    taken: Taker | None,
+    function: Callable[..., Any], options: list[inspect.Parameter], last: list[inspect.Parameter], taken: Taker | None
 ) -> Callable[[dict[str, Any]], Any]:
     """Appends the options for which the function's parameters stand; what calls it with the values of all options."""
     values: dict[str, Callable[[dict[str, Any]], Any]] = {}
