@@ -57,26 +57,26 @@ class PortUser:
     name: str
 
 
-def port_users(path: str, proc: Path = Path("/proc")) -> list[PortUser]:
+def port_users(path: str) -> list[PortUser]:
     """As far as this user may look into other processes; empty where the system has no /proc."""
     real = os.path.realpath(path)
     found = []
-    for folder in proc.glob("[0-9]*"):
+    for folder in Path("/proc").glob("[0-9]*"):
         pid = int(folder.name)
         if pid == os.getpid():
             continue
         try:
             opened = {os.readlink(link) for link in (folder / "fd").iterdir()}
             if real in opened and not opened & _TERMINAL_MAKERS:
-                found.append(PortUser(pid, program_name(pid, proc)))
+                found.append(PortUser(pid, program_name(pid)))
         except OSError:  # gone, or another user's
             continue
     return sorted(found, key=lambda user: user.pid)
 
 
-def program_name(pid: int, proc: Path = Path("/proc")) -> str:
+def program_name(pid: int) -> str:
     """The program by its command line; `OSError` where there is no such process."""
-    words = [Path(word).name for word in (proc / str(pid) / "cmdline").read_text(errors="replace").split("\0") if word]
+    words = [Path(word).name for word in Path(f"/proc/{pid}/cmdline").read_text(errors="replace").split("\0") if word]
     for at, word in enumerate(words):
         if word == "-m" and at + 1 < len(words):
             return words[at + 1]

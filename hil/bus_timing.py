@@ -76,11 +76,11 @@ def _append(value: int, count: int, crc: int, last: int, run: int, bits: int) ->
 
 
 @kernel
-def frame_bits(frames: np.ndarray, index: int) -> int:
-    """Exact length [bit] on the wire of `frames[index]` (WireFrame), with stuff bits and 3 interframe bits."""
-    identifier = int(np.int64(frames[index]["identifier"]))
-    size = int(np.int64(frames[index]["length"]))
-    payload = frames[index]["payload"]
+def frame_bits(frames: np.ndarray) -> int:
+    """Exact length [bit] on the wire of the first of `frames` (WireFrame), with stuff bits and 3 interframe bits."""
+    identifier = int(np.int64(frames[0]["identifier"]))
+    size = int(np.int64(frames[0]["length"]))
+    payload = frames[0]["payload"]
     remote = 1 if identifier & REMOTE else 0
     if identifier & EXTENDED:
         first, second = (identifier >> 18) & 0x7FF, identifier & 0x3FFFF
@@ -147,7 +147,7 @@ def _start_next(wire: np.ndarray, waiting: Waiting, on_wire: np.ndarray) -> None
     on_wire[0] = pending[winner * depth + heads[winner]]
     heads[winner] = (heads[winner] + 1) % depth
     counts[winner] -= 1
-    bits = frame_bits(on_wire, 0)
+    bits = frame_bits(on_wire)
     wire[0].sender = winner
     wire[0].bits = bits
     wire[0].delivered_ns = start_ns + (bits - INTERFRAME_BITS) * NANOSECONDS // wire[0].bitrate_bitps

@@ -28,6 +28,7 @@ from jointctl.hil.elmo_drive import ElmoInterpreter
 BITS_PER_CHARACTER = 10
 RECEIVE_MAX = 512
 LONGEST_WAIT_S = 0.005
+TURNAROUND_S = 100e-6  # from a command to its reply
 _CR, _SEMICOLON = 0x0D, 0x3B
 _GARBLED_IN, _GARBLED_OUT = 0xA5, 0xD2  # different, or the echo would come back whole
 _SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit()}
@@ -46,14 +47,13 @@ class LineFaults:
 class ElmoDevice:
     """A drive with its joint on a pseudo-terminal: `with ElmoDevice(interpreter, 115200) as device: device.path`."""
 
-    def __init__(self, interpreter: ElmoInterpreter, baud_rate_bitps: int, turnaround_s: float = 100e-6) -> None:
+    def __init__(self, interpreter: ElmoInterpreter, baud_rate_bitps: int) -> None:
         self.interpreter = interpreter
         self.baud_rate_bitps = baud_rate_bitps
         self.faults = LineFaults()
         self.commands = 0
         self.last_command = b""
         self._character_s = BITS_PER_CHARACTER / baud_rate_bitps
-        self._turnaround_s = turnaround_s
         self._incoming: deque[tuple[float, int]] = deque()
         self._outgoing: deque[tuple[float, bytes]] = deque()
         self._received = bytearray()
@@ -180,7 +180,7 @@ class ElmoDevice:
             self.commands += 1
             self.last_command = line
             reply = self._spoilt(self.interpreter.execute(line))
-            self._say(arrival_s + self._turnaround_s, reply)
+            self._say(arrival_s + TURNAROUND_S, reply)
 
     def _spoilt(self, reply: bytes) -> bytes:
         faults, number = self.faults, self.commands

@@ -41,7 +41,7 @@ from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.faults import append_frame, fault_rows, pass_frame, step_faults, take_due
-from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
+from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue, store_release_word
 
 ENETDOWN = errno_codes.ENETDOWN
 STOP_WORD = 0  # not zero: leave the loop
@@ -301,12 +301,6 @@ def run_device(service_fd: int, of: DeviceMemory) -> int:
             _flush_all(faults, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
-
-
-@kernel
-def store_release_word(words: np.ndarray, index: int, value: int) -> None:
-    """`store_release` for callers in Python."""
-    store_release(words, index, value)
 
 
 def _on_bus(frame: bytes, bus: int) -> bytes:

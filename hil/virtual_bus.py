@@ -267,7 +267,7 @@ def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool | None) -
         memory.bus[0].late += 1
         return
     if timing is None:
-        bits, bitrate = frame_bits(memory.frame, 0), memory.wire[0].bitrate_bitps
+        bits, bitrate = frame_bits(memory.frame), memory.wire[0].bitrate_bitps
         _deliver(node, bits, bitrate, memory.clients, memory.bus, memory.frame)
     else:
         pend_frame(memory.frame, node, began_ns, memory.waiting)
@@ -345,9 +345,9 @@ def run_hub(listener: int, wake: int, timing: bool | None, memory: HubMemory) ->
 
 
 @kernel
-def store_stop(stop_word: np.ndarray) -> None:
-    """Ask `run_hub` to end."""
-    store_release(stop_word, 0, 1)
+def store_release_word(words: np.ndarray, index: int, value: int) -> None:
+    """`store_release` for callers in Python."""
+    store_release(words, index, value)
 
 
 # --- The virtual CAN bus: a hub to which many programs connect, and which hands every frame to all the others ---
@@ -545,7 +545,7 @@ class VirtualBusHub:
         """Disconnect all clients and remove the socket; does nothing if the hub does not run."""
         if self._thread is None:
             return
-        store_stop(self._stop_word)
+        store_release_word(self._stop_word, 0, 1)  # `run_hub` ends
         os.eventfd_write(self._wake, 1)
         self._thread.join()
         self._thread = None

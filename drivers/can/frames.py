@@ -39,21 +39,17 @@ class Frame:
     payload: Annotated[np.ndarray, array_of(u1, 8)]
 
 
-def _stuffed_bits(length: int, extended: bool) -> int:
-    if not 0 <= length <= _LONGEST_DATA:
-        raise ValueError(f"data length (={length}) must be in [0..{_LONGEST_DATA}] bytes")
-    return (_EXTENDED_STUFFED_BITS if extended else _STANDARD_STUFFED_BITS) + 8 * length
-
-
 def worst_frame_bits(length: int, extended: bool = False) -> int:
     """Bits of a frame of `length` data bytes at worst: one stuff bit after the first 5 bits, then after every 4."""
-    stuffed = _stuffed_bits(length, extended)
+    if not 0 <= length <= _LONGEST_DATA:
+        raise ValueError(f"data length (={length}) must be in [0..{_LONGEST_DATA}] bytes")
+    stuffed = (_EXTENDED_STUFFED_BITS if extended else _STANDARD_STUFFED_BITS) + 8 * length
     return stuffed + (stuffed - 1) // 4 + _TAIL_BITS
 
 
-def worst_cycle_bits(lengths: Iterable[int], extended: bool = False) -> int:
+def worst_cycle_bits(lengths: Iterable[int]) -> int:
     """Worst-case bits of one cycle: the sum over its frames, each given by its number of data bytes."""
-    return sum(worst_frame_bits(length, extended) for length in lengths)
+    return sum(map(worst_frame_bits, lengths))
 
 
 def bus_load(frames_per_cycle: Sequence[int], rate_Hz: float, bitrate_bitps: int) -> float:

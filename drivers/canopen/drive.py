@@ -232,7 +232,7 @@ class CanopenDrive:
                 self._reads = SdoReads(self._network, self._node, lambda: round(self._clock() * 1e9))
             if self._thermometer is None and self._settings.temperature is not None:
                 wanted = self._settings.temperature
-                self._thermometer = Thermometer(self._network, self._node, wanted, self._eds.name, reads=self._reads)
+                self._thermometer = Thermometer(self._node, wanted, self._eds.name, self._reads)
             self._objects.forget_verified()
             findings = commission(self._objects, self._settings, self._eds, self._pause, self._prove_watchdog)
             encoder = self._encoder.commission()
@@ -429,15 +429,7 @@ _WIDEST_BITS = 32  # of an expedited answer
 class Thermometer:
     """Call `poll` often; it sends a request a second and returns what has come of the one before."""
 
-    def __init__(
-        self,
-        network: canopen.Network,
-        node: canopen.RemoteNode,
-        wanted: TemperatureObject,
-        eds_name: str,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-        reads: SdoReads | None = None,
-    ) -> None:
+    def __init__(self, node: canopen.RemoteNode, wanted: TemperatureObject, eds_name: str, reads: SdoReads) -> None:
         """`reads`: those of the same node, which has one SDO channel.  `DeviceError` if the EDS has no such number."""
         self._wanted = wanted
         self._name = f"object {object_name(wanted.index, wanted.sub)} (temperature)"
@@ -449,7 +441,7 @@ class Thermometer:
             )
         self._variable = variable
         self._newest: Reading | None = None
-        self._reads = reads or SdoReads(network, node, clock_ns)
+        self._reads = reads
         self._reads.add(wanted.index, wanted.sub, PERIOD_S, self._on_answer)
 
     def _on_answer(self, time_ns: int, data: bytes | None, problem: str) -> None:

@@ -464,9 +464,9 @@ class Dialogue:
         """The value as a whole number."""
         return round(self.number(name, index))
 
-    def assign(self, name: str, value: float, index: int | None = None, *, attempts: int = ATTEMPTS) -> None:
+    def assign(self, name: str, value: float, index: int | None = None) -> None:
         """Set a value; the drive says that it took it."""
-        self.ask(encode(name, index, value), attempts)
+        self.ask(encode(name, index, value))
 
     def assign_verified(self, name: str, value: float, index: int | None = None) -> float:
         """Set, read back and compare; returns what the drive keeps."""

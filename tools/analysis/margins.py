@@ -54,7 +54,7 @@ def zero_between(function: Function, low: float, high: float, tolerance: float =
             return 0.5 * (low + high)
 
 
-def least_between(function: Function, low: float, high: float, tolerance: float = 1e-9) -> tuple[float, float]:
+def least_between(function: Function, low: float, high: float) -> tuple[float, float]:
     """(place, value) of the least value that `function`, as above, has on the grids from `low` to `high` > `low`."""
     while True:
         places = np.linspace(low, high, _ROUND_POINTS)
@@ -62,7 +62,7 @@ def least_between(function: Function, low: float, high: float, tolerance: float 
         least = int(np.argmin(values))
         last_width = high - low
         low, high = float(places[max(least - 1, 0)]), float(places[min(least + 1, _ROUND_POINTS - 1)])
-        if high - low <= tolerance or high - low >= last_width:
+        if high - low <= 1e-9 or high - low >= last_width:
             return float(places[least]), float(values[least])
 
 

@@ -205,9 +205,9 @@ def synthetic_sweep(seed: int = 1) -> FrictionData:
     )
 
 
-def identify_paper_friction(options: Options | None = None, seed: int = 1) -> PaperIdentification:
+def identify_paper_friction(options: Options | None = None) -> PaperIdentification:
     """Identify the synthetic sweep with the swarm of the paper, or with other options."""
-    data = synthetic_sweep(seed)
+    data = synthetic_sweep(seed=1)
     found = identify_friction(data, options or Options(model="multi-stage"))
     truth = friction_curve_Nm(paper_friction(), data.velocity_radps)
     curve = np.empty_like(truth)
@@ -353,17 +353,17 @@ def paper_rows(runs: Runs, identification: PaperIdentification | None) -> list[P
     return rows
 
 
-def network_difference_mrad(runs: Runs, after_s: float = 1.0) -> float:
+def network_difference_mrad(runs: Runs) -> float:
     """Greatest difference of the true position errors with the network and with one integrator."""
     first, second = runs["network, R1"].run, runs["one integrator, R1"].run
-    later = first.tracking & (first.log.trajectory_s > after_s)
+    later = first.tracking & (first.log.trajectory_s > _START_s)
     return float(np.max(np.abs(first.true_error_rad - second.true_error_rad)[later])) * 1e3
 
 
 # --- The paper's figures 8 to 14, redrawn from our runs ---
 
 
-_START_s = 1.0
+_START_s, _CHANGE_FROM_s = 1.0, 70.0
 
 
 def _draw(axis: Axes, time_s: np.ndarray, values: np.ndarray, label: str = "", color: str = BLUE, **style: Any) -> None:
@@ -473,14 +473,14 @@ def draw_friction_model(runs: Runs) -> Any:
         return _over_time(figure, axes)
 
 
-def draw_change(runs: Runs, change: str, title: str, from_s: float = 70.0) -> Any:
+def draw_change(runs: Runs, change: str, title: str) -> Any:
     """Figs. 12 to 14: tracking, network, error around a change; the precise law beside it."""
     made, other = runs[f"{change}, R1"], runs[f"precise, {change}, R1"]
     log, time_s = _tracked(made.run)
     fine, fine_s = _tracked(other.run)
     with canvas(9.5, title) as figure:
         axes = figure.subplots(4, 1, sharex=True, height_ratios=(2, 2, 2.4, 2))
-        late, fine_late = time_s >= from_s, fine_s >= from_s
+        late, fine_late = time_s >= _CHANGE_FROM_s, fine_s >= _CHANGE_FROM_s
         t = time_s[late]
         _draw(axes[0], t, log.desired_position_rad[late], "desired", ORANGE, linewidth=2.2)
         _draw(axes[0], t, log.position_rad[late], "measured", BLUE)

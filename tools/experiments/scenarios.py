@@ -253,9 +253,9 @@ class ErrorFigures:
 FAILED = (math.inf, math.inf, -math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)
 
 
-def settling_s(time_s: np.ndarray, error_rad: np.ndarray, within_rad: float = SETTLED_rad) -> float:
-    """Time after which |error| stays within the band; inf if it leaves it in the last tenth; arrays (N,)."""
-    outside = np.flatnonzero(np.abs(error_rad) > within_rad)
+def settling_s(time_s: np.ndarray, error_rad: np.ndarray) -> float:
+    """Time after which |error| stays within SETTLED_rad; inf if it leaves it in the last tenth; arrays (N,)."""
+    outside = np.flatnonzero(np.abs(error_rad) > SETTLED_rad)
     if not len(outside):
         return 0.0
     last_s = float(time_s[outside[-1]])

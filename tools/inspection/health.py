@@ -280,13 +280,13 @@ def bus_budget(config: Config) -> Finding:
     return Finding("bus budget", OK if good else PROBLEM, text, "" if good else "lower loop.rate_Hz", numbers)
 
 
-def sdo_round_trips_us(bus: can.BusABC, node: int, reads: int = SDO_READS) -> list[float]:
-    """Times [us] to read 1000h of `node`, fewer than `reads` where answers stay away; writes nothing."""
+def sdo_round_trips_us(bus: can.BusABC, node: int) -> list[float]:
+    """Times [us] to read 1000h of `node`, fewer than SDO_READS where answers stay away; writes nothing."""
     request = can.Message(
         arbitration_id=SDO_REQUEST_ID + node, is_extended_id=False, data=struct.pack("<BHB4x", 0x40, 0x1000, 0)
     )
     times: list[float] = []
-    for _ in range(reads):
+    for _ in range(SDO_READS):
         started_s = time.monotonic()
         bus.send(request, _SDO_TIMEOUT_S)
         while (left_s := started_s + _SDO_TIMEOUT_S - time.monotonic()) > 0.0:

@@ -145,14 +145,12 @@ class SdoReader:
     and after its motion, and for a temperature only when it is quiet.  An answer that got mixed up is requested again.
     """
 
-    def __init__(
-        self, network: canopen.Network, node: int, objects: Objects | None = None, timeout_s: float = TIMEOUT_S
-    ) -> None:
+    def __init__(self, network: canopen.Network, node: int, objects: Objects | None = None) -> None:
         self.objects = Objects() if objects is None else objects
         self.node = node
         dictionary = self.objects.dictionary
         self.remote = network.add_node(node, new_dictionary() if dictionary is None else dictionary)
-        self.remote.sdo.RESPONSE_TIMEOUT = timeout_s
+        self.remote.sdo.RESPONSE_TIMEOUT = TIMEOUT_S
 
     def upload(self, index: int, sub: int = 0) -> bytes | Refusal:
         for _ in range(ATTEMPTS):

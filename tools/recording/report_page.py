@@ -122,9 +122,9 @@ def _environment() -> Environment:
     )
 
 
-def page(title: str, sections: Sequence[Section], *, subtitle: str = "", made_at: str | None = None) -> str:
-    """The HTML text.  `made_at` (default: now) is printed at the foot."""
-    made_at = made_at if made_at is not None else datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+def page(title: str, sections: Sequence[Section], *, subtitle: str = "") -> str:
+    """The HTML text, with the time now at its foot."""
+    made_at = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     template = _environment().get_template(_TEMPLATE)
     context: dict[str, Any] = {"title": title, "subtitle": subtitle, "sections": sections, "made_at": made_at}
     return template.render(**context)

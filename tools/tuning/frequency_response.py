@@ -58,6 +58,7 @@ FULL_FROM_Hz = 3.0  # lines below are smaller: they would turn the motion round
 CRESTS = 200  # random phases that are tried for a low peak
 TORQUE_SHARE = 0.15  # of limits.torque_max_Nm: peak of the multisine, unless the user allows less
 LEAST_SHARE = 1.0 / 8.0  # of that peak: where it begins
+SEED = 1
 FRICTION_SPARE = 1.2  # of the static friction, which the excitation leaves room for
 
 LARGEST_radps2 = 8.0  # that peak over the inertia: more would turn a light joint round, and its friction with it
@@ -87,7 +88,7 @@ class Multisine:
     wave: np.ndarray  # (N,)
 
 
-def multisine(rate_Hz: float, length_s: float, seed: int = 1) -> Multisine:
+def multisine(rate_Hz: float, length_s: float) -> Multisine:
     """Lines from LOWEST_Hz to a quarter of the rate, even steps of the logarithm, phases with a low peak."""
     samples = round(rate_Hz * length_s)
     highest = HIGHEST_SHARE * rate_Hz
@@ -98,7 +99,7 @@ def multisine(rate_Hz: float, length_s: float, seed: int = 1) -> Multisine:
     kept = np.array([b for b in bins if b <= highest * length_s])
     frequency = kept / length_s
     size = np.minimum(1.0, frequency / FULL_FROM_Hz)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(SEED)
     best = np.zeros(samples)
     lowest = math.inf
     for _ in range(CRESTS):
@@ -149,13 +150,13 @@ def speed_and_period(config: Config) -> tuple[float, float]:
     )
 
 
-def legs_of(config: Config, pairs: int, seed: int = 1) -> Legs:
+def legs_of(config: Config, pairs: int) -> Legs:
     """`pairs` of legs there and back, each pair at a speed of its own."""
     speed, length_s = speed_and_period(config)
     acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
     rate = config.loop.rate_Hz
     factors = 1.0 + SPEED_SPREAD * np.linspace(-1.0, 1.0, max(pairs, 2))[:pairs]
-    np.random.default_rng(seed).shuffle(factors)
+    np.random.default_rng(SEED).shuffle(factors)
     parts, starts, count, widths = [np.zeros(round(FADE_s * rate))], [], round(FADE_s * rate), []
     for factor in factors:
         top = float(factor * speed)

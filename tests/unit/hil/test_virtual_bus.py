@@ -88,7 +88,7 @@ def test_crc_has_the_published_check_value() -> None:
 @given(identifier=st.integers(0, 0x1FFFFFFF), remote=st.booleans(), payload=st.binary(max_size=8))
 def test_frames_have_the_exact_length(flag: int, least: int, identifier: int, remote: bool, payload: bytes) -> None:
     word = (identifier if flag else identifier & 0x7FF) | flag | (REMOTE if remote else 0)
-    bits = frame_bits(wire_frame(word, payload), 0)
+    bits = frame_bits(wire_frame(word, payload))
     assert bits == bits_by_text(word, payload)
     carried = 0 if remote else len(payload)
     assert least + 8 * carried <= bits <= worst_frame_bits(carried, extended=bool(flag))
@@ -126,7 +126,7 @@ class Timeline:
 def test_a_frame_is_there_when_its_last_bit_is_over() -> None:
     bus = Timeline()
     bus.pend(0, 0x155, 5000)
-    over_ns = 5000 + (frame_bits(wire_frame(0x155), 0) - 3) * 1000
+    over_ns = 5000 + (frame_bits(wire_frame(0x155)) - 3) * 1000
     assert bus.finish(5000) is None
     assert bus.finish(over_ns - 1) is None
     assert bus.finish(over_ns) == (0, 0x155)
@@ -147,8 +147,8 @@ def test_back_to_back_frames_are_three_bits_apart_even_after_a_late_wake_up() ->
     bus = Timeline()
     bus.pend(0, 0x155, 0)
     bus.pend(0, 0x2AA, 0)
-    first = frame_bits(wire_frame(0x155), 0) * 1000
-    second = frame_bits(wire_frame(0x2AA), 0) * 1000
+    first = frame_bits(wire_frame(0x155)) * 1000
+    second = frame_bits(wire_frame(0x2AA)) * 1000
     assert bus.finish(first + second - 3001) == (0, 0x155)
     assert bus.finish(first + second - 3001) is None
     assert bus.finish(first + second - 3000) == (0, 0x2AA)
@@ -177,7 +177,7 @@ def test_lower_bit_rates_take_longer(bitrate: int) -> None:
     bus = Timeline()
     bus.wire["bitrate_bitps"] = bitrate
     bus.pend(0, 0x155, 0)
-    over_ns = (frame_bits(wire_frame(0x155), 0) - 3) * (10**9 // bitrate)
+    over_ns = (frame_bits(wire_frame(0x155)) - 3) * (10**9 // bitrate)
     assert bus.finish(over_ns - 1) is None
     assert bus.finish(over_ns) == (0, 0x155)
 
@@ -212,7 +212,7 @@ def test_counters(path: Path) -> None:
             assert b.recv(64) == FRAME
         record = new(WireFrame)
         record["identifier"], record["length"], record["payload"] = 0x601, 8, range(8)
-        bits = 10 * frame_bits(record, 0)
+        bits = 10 * frame_bits(record)
         eventually(lambda: hub.counters["frames"] == 10)
         counters = hub.counters
         assert (counters["bits"], counters["busy_ns"]) == (bits, bits * 2000)

@@ -11,6 +11,7 @@ import pytest
 from canopen.objectdictionary import ODVariable
 
 from jointctl.drivers.canopen.drive import Thermometer
+from jointctl.drivers.canopen.sdo import SdoReads
 from jointctl.drivers.canopen.settings import TemperatureObject
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import DeviceError
@@ -48,7 +49,8 @@ class Bench:
         node.object_dictionary.add_object(variable)
         self.line, self.now_ns = Line(), 10 * S
         place = {"index": INDEX, "unit_degC": 0.1, **wanted}
-        self.meter = Thermometer(self.line, node, TemperatureObject(**place), "x.eds", lambda: self.now_ns)  # type: ignore[arg-type]
+        reads = SdoReads(self.line, node, lambda: self.now_ns)  # type: ignore[arg-type]
+        self.meter = Thermometer(node, TemperatureObject(**place), "x.eds", reads)  # type: ignore[arg-type]
 
     def after(self, seconds: float) -> Reading | None:
         self.now_ns += round(seconds * S)
