@@ -67,7 +67,6 @@ from jointctl.firmware_py.states import (
 )
 from jointctl.firmware_py.trajectory import NO_REPETITION, Repetition, approach_at, brake_step, reference_at, repetition
 
-# --- One tick of one joint: sample in, command out ---
 # position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
 #
 # With CommandKind.VELOCITY and POSITION the last part is velocity or target -> finite, limits, acceleration limit.
@@ -383,8 +382,6 @@ def command_axis(
     step_stopping(constants, state, sample)
     write_command(state, command)
 
-
-# --- What a drive gets that closes its velocity loop, or its position loop as well: limits included ---
 
 # --- The velocity command: the reference's velocity plus a small position correction ---
 # For a drive that closes the velocity loop itself:

@@ -50,9 +50,6 @@ from jointctl.firmware_py.records import (
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, ZeroSpeedRule
 
-# --- Multi-stage friction model (11): Stribeck near zero speed, a cubic polynomial beyond the knee ---
-
-
 DEGREE = math.pi / 180.0
 
 

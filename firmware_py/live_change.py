@@ -128,12 +128,6 @@ def move_duration_s(constants: ChangeConstants, distance_rad: float) -> float:
 
 
 @kernel
-def _copy_gains(source: Gains, target: Gains) -> None:
-    target.kp, target.kv, target.ki = source.kp, source.kv, source.ki
-    target.observer_radps, target.learning_rate = source.observer_radps, source.learning_rate
-
-
-@kernel
 def gains_of(law: LawConstants, gains: Gains) -> None:
     """Fill `gains` with those in force."""
     gains.kp, gains.kv, gains.ki = law.kp, law.kv, law.ki
@@ -166,7 +160,7 @@ def _take_gains(constants: AxisConstants, state: AxisState, request: ChangeReque
         return ChangeAnswer.GAIN_LIMIT
     change = state.change
     gains_of(constants.law, change.start)
-    _copy_gains(request.gains, change.target)
+    change.target = request.gains
     change.ramp_s = 0.0
     change.ramping = 1
     return ChangeAnswer.TAKEN
@@ -291,15 +285,6 @@ def _fetch(stream: StreamConstants, number: int, point: SetPoint) -> None:
 
 
 @kernel
-def _copy(source: SetPoint, target: SetPoint) -> None:
-    target.time_ns = source.time_ns
-    target.position_rad = source.position_rad
-    target.velocity_radps = source.velocity_radps
-    target.acceleration_radps2 = source.acceleration_radps2
-    target.torque_Nm = source.torque_Nm
-
-
-@kernel
 def between(before: SetPoint, after: SetPoint, time_ns: int, reference: Reference) -> float:
     """Fill `reference` at a time between two set-points; returns the torque there [Nm]."""
     duration_s, c2, c3 = cubic(before, after)
@@ -338,8 +323,8 @@ def _next(constants: AxisConstants, state: AxisState, time_ns: int, elapsed_ns: 
         if set_point_problem(constants.limits, stream, brake_radps2, own.after, own.coming) != SetPointProblem.NONE:
             own.refused += 1
             continue
-        _copy(own.after, own.before)
-        _copy(own.coming, own.after)
+        own.before = own.after
+        own.after = own.coming
         own.following = 1
         if own.after.time_ns > time_ns:
             return True

@@ -20,7 +20,6 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.program import POLL_S, TABLE_ROWS, Newest, NewMotion, Source, axes_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.run_log import ERROR, Event
 from jointctl.tools.scoping.remote import remote
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
@@ -28,7 +27,7 @@ from jointctl.tools.session.control import Control, in_program
 from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loop_memory import RING_RECORDS
-from jointctl.tools.session.plan import FreeMotion, resolve_any
+from jointctl.tools.session.plan import FreeMotion, resolve
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
@@ -85,21 +84,11 @@ class _ProgramDisplay(OnlyShows):
     def show(self, snapshot: Snapshot) -> None:
         """See `Display`."""
 
-    def event(self, event: Event) -> None:
-        if event.level >= ERROR:
-            self.notes.append(event.text)
-
     def requests(self) -> Sequence[ViewerRequest]:
         self._stop_if_over()
         taken = self.motions[:]
         del self.motions[: len(taken)]
         return taken
-
-    def __enter__(self) -> _ProgramDisplay:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to take away."""
 
 
 class _SessionThread(threading.Thread):
@@ -158,7 +147,7 @@ class LiveMotor:
             if control.signals.commanded_ns:
                 raise MotionFault(f"stopped by {control.signals.name} before it began; nothing has moved", AGAIN)
             self._approval = _Approval(control.signals.leave_if_asked, self._stop_if_over)
-            plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
+            plan = resolve(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
             display = others.beside(lambda _: self._display)
             self._session = Session(plan, self._approval, output, control, display, others.set_points)

@@ -106,7 +106,7 @@ def prepare_target(file: Path | None) -> None:
         raise DataError(f"{file}: is a folder, not a file to write")
 
 
-def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:
+def replace_file(path: Path, content: bytes, check: Callable[[Path], object] | None = None) -> None:
     """Write a new file beside `path`, let `check` read it, then put it in place in one step.
 
     `DataError` if it cannot be written: then `path` is as it was, and nothing is beside it.

@@ -289,25 +289,33 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 @kernel
 def answer_owed(port: CanopenPort) -> bool:
     """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it."""
-    wanted = SEEN_FIRST if port.second.tpdo_id == 0 else SEEN_FIRST | SEEN_SECOND
+    wanted = SEEN_FIRST if port.second.tpdo_id == 0 else _BOTH
     return port.cycle > 0 and port.seen & wanted != wanted
 
 
 @kernel
-def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
-    """Take statusword, position and torque; False if the TPDO is too short, or doubled or late.
+def _answers(port: CanopenPort, frame: Frame, tpdo_length: int, encoder: int) -> bool:
+    """Whether the TPDO of an `encoder`, SEEN_FIRST or SEEN_SECOND, is long enough, and neither doubled nor late.
 
-    The drive sends one TPDO for each SYNC.  One that comes between the cycles although the SYNC was answered repeats
-    or delays an old value: it must not look like a new sample.
+    One is sent for each SYNC.  One that comes between the cycles although the SYNC was answered repeats or delays an
+    old value: it must not look like a new sample.
     """
-    if frame.length < port.tpdo_length:
+    if frame.length < tpdo_length:
         port.malformed += 1
         return False
-    if port.in_cycle == 0 and port.answered & SEEN_FIRST != 0:
+    if port.in_cycle == 0 and port.answered & encoder != 0:
         port.surplus += 1
         return False
     if port.in_cycle != 0:
-        port.answered |= SEEN_FIRST
+        port.answered |= encoder
+    return True
+
+
+@kernel
+def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
+    """Take statusword, position and torque; True if that makes a new sample."""
+    if not _answers(port, frame, port.tpdo_length, SEEN_FIRST):
+        return False
     sample.status_word = get_u16(frame.payload, port.status_at)
     state = decode_state(sample.status_word)
     port.repeated = 1 if state == port.state else 0
@@ -327,15 +335,9 @@ def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
 
 @kernel
 def _accept_second(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
-    """Take the position of a second encoder; as for the drive's, one that repeats an old value is none."""
-    if frame.length < port.second.tpdo_length:
-        port.malformed += 1
+    """Take the position of a second encoder; True if that makes a new sample."""
+    if not _answers(port, frame, port.second.tpdo_length, SEEN_SECOND):
         return False
-    if port.in_cycle == 0 and port.answered & SEEN_SECOND != 0:
-        port.surplus += 1
-        return False
-    if port.in_cycle != 0:
-        port.answered |= SEEN_SECOND
     take_second_counts(port.second, get_i32(frame.payload, port.second.position_at))
     port.seen |= SEEN_SECOND
     return publish_sample(port, sample, now_ns)

@@ -83,11 +83,12 @@ class OtherControllers(can.Listener):
         self._clock = clock
         self._wanted_s = 0.0 if private else LISTEN_S
         self._started_s = clock()
-        self._nodes, self._master_node = frozenset(nodes), master_node
-        self._rpdo_ids = {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
+        self._master_node = master_node
+        self.nodes: frozenset[int] = frozenset()  # the drives and encoders of this program
+        self._rpdo_ids: dict[int, str] = {}
         self._lock = threading.Lock()
         self._beside_own_loop = False
-        self._commands = {NMT_ID, *(SDO_REQUEST_ID + node for node in nodes)}
+        self._commands = {NMT_ID}
         self._echoes: bool | None = None  # whether our own frames come back; None = not known yet
         self._own: Counter[tuple[int, bytes]] = Counter()  # that have not come back yet
         self._seen: Counter[str] = Counter()
@@ -96,14 +97,15 @@ class OtherControllers(can.Listener):
         self._answers: dict[tuple[int, bytes], bytes] = {}
         self._doubled: set[int] = set()  # nodes that have answered one request in two ways
         self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
+        self.add_nodes(nodes)
 
     def add_nodes(self, nodes: Collection[int]) -> None:
         """More nodes of the same program, before anything is sent to them."""
         with self._lock:
-            self._nodes |= frozenset(nodes)
+            self.nodes |= frozenset(nodes)
             self._rpdo_ids |= {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
             self._commands |= {SDO_REQUEST_ID + node for node in nodes}
-            self.heartbeats -= self._nodes
+            self.heartbeats -= self.nodes
 
     def on_message_received(self, msg: can.Message) -> None:
         if msg.is_error_frame or msg.is_extended_id:
@@ -118,18 +120,18 @@ class OtherControllers(can.Listener):
                 self._echoes = True
                 return
             self._identifiers[identifier] += 1
-            if identifier - SDO_ANSWER_ID in self._nodes and data and data[0] >> 5 == _UPLOAD:
+            if identifier - SDO_ANSWER_ID in self.nodes and data and data[0] >> 5 == _UPLOAD:
                 self._note_answer((identifier - SDO_ANSWER_ID, data[1:4]), data)
             if words := self._asked(identifier) if msg.is_remote_frame else self._words(identifier, data):
                 self._seen[words] += 1
             elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE and not msg.is_remote_frame:
-                if (node := identifier - HEARTBEAT_ID) not in self._nodes:
+                if (node := identifier - HEARTBEAT_ID) not in self.nodes:
                     self.heartbeats.add(node)
 
     def sent(self, identifier: int, data: bytes) -> None:
         """This program is about to send a frame."""
         with self._lock:
-            if identifier - SDO_REQUEST_ID in self._nodes:
+            if identifier - SDO_REQUEST_ID in self.nodes:
                 place = identifier - SDO_REQUEST_ID, data[1:4]
                 self._open[place] = max(self._open[place], 0) + 1
             if self._echoes is None and self._own:  # the first one has not come back
@@ -148,7 +150,7 @@ class OtherControllers(can.Listener):
     def _asked(self, identifier: int) -> str:
         """What a remote frame asks for, if of our nodes: state (node guarding, CiA 301, 7.2.8.2.2.1) or a TPDO."""
         base, node = identifier & FUNCTION_MASK, identifier & NODE_MASK
-        if self._beside_own_loop or node not in self._nodes:
+        if self._beside_own_loop or node not in self.nodes:
             return ""
         if base == HEARTBEAT_ID:
             return f"node guarding of node {node} ({identifier:03X}h)"
@@ -163,10 +165,10 @@ class OtherControllers(can.Listener):
             return f"SDO request to node {node} that writes object {index:04X}" if critical else ""
         if identifier == SYNC_ID:
             return f"SYNC ({SYNC_ID:03X}h)"
-        if identifier == NMT_ID and len(data) >= 2 and (data[1] == _ALL_NODES or data[1] in self._nodes):
+        if identifier == NMT_ID and len(data) >= 2 and (data[1] == _ALL_NODES or data[1] in self.nodes):
             command = NmtCommand(data[0]).name.lower().replace("_", " ") if data[0] in set(NmtCommand) else "unknown"
             return f"NMT {command!r} to {f'node {data[1]}' if data[1] else 'all nodes'}"
-        if identifier - SDO_REQUEST_ID in self._nodes:
+        if identifier - SDO_REQUEST_ID in self.nodes:
             return f"SDO request to node {identifier - SDO_REQUEST_ID} ({identifier:03X}h)"
         if identifier == HEARTBEAT_ID + self._master_node:
             return own_heartbeat(identifier)
@@ -176,14 +178,9 @@ class OtherControllers(can.Listener):
 
     def _written(self, identifier: int, data: bytes) -> int | None:
         """The object that an SDO request writes (CiA 301, 7.2.4.3.3 and 7.2.4.3.9); None where it writes none."""
-        if identifier - SDO_REQUEST_ID not in self._nodes or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+        if identifier - SDO_REQUEST_ID not in self.nodes or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
             return None
         return int.from_bytes(data[1:3], "little")
-
-    @property
-    def nodes(self) -> frozenset[int]:
-        """The drives and encoders of this program."""
-        return self._nodes
 
     def own_loop_begins(self) -> None:
         """SYNC, RPDOs and heartbeats may be our own from here on, and reading an object disturbs no one."""

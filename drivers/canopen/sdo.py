@@ -158,14 +158,11 @@ class ObjectAccess:
                 return ""  # the caller that needs the object will see
         return "" if self._answered[index, sub] else f"node {self._node.id}, unlike EDS {self._eds_name}, has no"
 
-    def require(self, index: int, sub: int = 0, *, what: str) -> None:
-        """`DeviceError` unless the EDS lists the object."""
-        self._required(index, sub, what)
-
     def _variable(self, index: int, sub: int) -> Any:
         return self._node.object_dictionary.get_variable(index, sub)
 
-    def _required(self, index: int, sub: int, what: str) -> Any:
+    def require(self, index: int, sub: int = 0, *, what: str) -> Any:
+        """What the EDS says of the object; `DeviceError` unless it lists it."""
         variable = self._variable(index, sub)
         if variable is None and (index, sub) in self._unusable:
             raise DeviceError(
@@ -204,16 +201,9 @@ class ObjectAccess:
             hint="use the EDS file that belongs to this drive and firmware",
         )
 
-    def _encoded(self, variable: ODVariable, value: int, what: str) -> bytes:
-        try:
-            return bytes(variable.encode_raw(value))
-        except (ObjectDictionaryError, ValueError, TypeError):
-            place = f"EDS {self._eds_name}: object {object_name(variable.index, variable.subindex)} ({what})"
-            raise DeviceError(f"{place} has {len(variable)} bits, which do not hold {value}") from None
-
-    def highest(self, index: int, sub: int = 0) -> int | None:
+    def highest(self, index: int) -> int | None:
         """HighLimit of the EDS; None if it has none."""
-        variable = self._variable(index, sub)
+        variable = self._variable(index, 0)
         return None if variable is None else variable.max
 
     def indices(self, first: int, last: int) -> Iterator[int]:
@@ -222,7 +212,7 @@ class ObjectAccess:
 
     def read(self, index: int, sub: int = 0, *, what: str) -> int:
         """Integer value of an object; `what` names it in messages."""
-        variable = self._required(index, sub, what)
+        variable = self.require(index, sub, what=what)
         return self._transfer(
             lambda: self._number(variable, self._node.sdo.upload(index, sub), what), "reading", index, sub, what
         )
@@ -245,7 +235,7 @@ class ObjectAccess:
 
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
-        data = self._encoded(self._required(index, sub, what), value, what)
+        data = self.encoded(index, sub, value, what=what)
         action = f"writing {value_text(index, sub, value)} to"
         self._transfer(lambda: download(self._node.sdo, index, sub, data), action, index, sub, what)
 
@@ -310,7 +300,12 @@ class ObjectAccess:
 
     def encoded(self, index: int, sub: int, value: int, *, what: str) -> bytes:
         """A value as the object holds it on the wire."""
-        return self._encoded(self._required(index, sub, what), value, what)
+        variable = self.require(index, sub, what=what)
+        try:
+            return bytes(variable.encode_raw(value))
+        except (ObjectDictionaryError, ValueError, TypeError):
+            place = f"EDS {self._eds_name}: object {object_name(index, sub)} ({what})"
+            raise DeviceError(f"{place} has {len(variable)} bits, which do not hold {value}") from None
 
     def forget_verified(self) -> None:
         """Commissioning begins anew."""

@@ -85,11 +85,6 @@ _BG, _BG_REPLY = 3, 1
 LARGEST_SHARE = 0.9  # of a period that the measured exchange may take
 
 
-def _jog_characters(velocity_digits: int) -> int:
-    """JV=-d..d and its CR."""
-    return 5 + velocity_digits
-
-
 def cycle_characters(echo: bool, velocity_digits: int = 0) -> int:
     """Characters of one cycle at worst, both directions; echo counts every character of a command twice.
 
@@ -97,7 +92,7 @@ def cycle_characters(echo: bool, velocity_digits: int = 0) -> int:
     """
     commands, replies = sum(_COMMANDS), sum(_REPLIES)
     if velocity_digits:
-        commands += _jog_characters(velocity_digits) + _BG - _TC
+        commands += 5 + velocity_digits + _BG - _TC  # JV=-d..d and its CR, and BG, in the place of TC
         replies += _BG_REPLY
     return commands * (2 if echo else 1) + replies
 

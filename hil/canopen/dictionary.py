@@ -506,16 +506,12 @@ class ParameterStore:
             if sub == 1 or (sub == 2) == (key[0] < 0x2000):
                 saved.pop(key, None)
                 if index == 0x1010:
-                    saved[key] = self._present(key)
+                    is_text = isinstance(self._factory[key], bytes)
+                    saved[key] = self._objects.read(*key) if is_text else self._objects.value(*key)
         self._write_file(saved)
         self._saved = saved
         for key, value in self._factory.items():
             self._objects.set_default(*key, saved.get(key, value))
-
-    def _present(self, key: tuple[int, int]) -> int | bytes:
-        if isinstance(self._factory[key], bytes):
-            return self._objects.read(*key)
-        return self._objects.value(*key)
 
     def _write_file(self, saved: dict[tuple[int, int], int | bytes]) -> None:
         if self._path is None:

@@ -97,16 +97,12 @@ def _position_loop(device: Device, position_rad: float, velocity_radps: float, f
 
 
 @kernel
-def _interpolation_period_s(drive: DriveObjects) -> float:
-    return float(drive.interpolation_time) * 10.0 ** float(drive.interpolation_exponent)
-
-
-@kernel
 def _cyclic_position(device: Device, position_rad: float, velocity_radps: float, dt_s: float) -> float:
     """CSP: straight line from the last reference to the new target within 60C2."""
     target = int64(device.drive.target_position)
     if target != device.segment_target:
-        period_s = max(_interpolation_period_s(device.drive), dt_s)
+        period_s = float(device.drive.interpolation_time) * 10.0 ** float(device.drive.interpolation_exponent)
+        period_s = max(period_s, dt_s)
         device.segment_target = target
         device.segment_left_s = period_s
         device.segment_velocity_radps = (target / device.counts_per_rad - device.reference_position_rad) / period_s

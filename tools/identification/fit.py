@@ -538,16 +538,13 @@ class Noise:
 
 def noise_of(fits: Sequence[Fit]) -> list[Noise]:
     """The noise of each direction: of both together, unless they differ significantly."""
-    own = [Noise(fit.rss / free, free) for fit in fits for free in (_freedom(fit),)]
+    free = [max(len(fit.problem.x) - fit.problem.form.parameters, 1) for fit in fits]
+    own = [Noise(fit.rss / count, count) for fit, count in zip(fits, free, strict=True)]
     most, least = (pick(own, key=lambda noise: noise.variance_Nm2) for pick in (max, min))
     if most.variance_Nm2 > least.variance_Nm2 * stats.f.ppf(_ALIKE, most.freedom, least.freedom):
         return own
     freedom = sum(noise.freedom for noise in own)
     return [Noise(sum(fit.rss for fit in fits) / freedom, freedom)] * len(own)
-
-
-def _freedom(fit: Fit) -> int:
-    return max(len(fit.problem.x) - fit.problem.form.parameters, 1)
 
 
 def uncertainty(fit: Fit, noise: Noise) -> Uncertainty:

@@ -93,9 +93,7 @@ _SLOTS_KEPT = 100  # that wait for the records of other joints
 def joint_state_type(names: tuple[str, ...]) -> np.dtype[Any]:
     """A message with the states of these joints; the names are in it."""
     texts = [field for i, name in enumerate(names) for field in ((f"length_{i}", "<u4"), (f"name_{i}", _text(name)))]
-    values = (
-        ("positions", "position_rad"), ("velocities", "velocity_radps"), ("efforts", "effort_Nm")
-    )  # fmt: skip
+    values = (("positions", "position_rad"), ("velocities", "velocity_radps"), ("efforts", "effort_Nm"))
     arrays = [field for count, name in values for field in ((count, "<u4"), (name, "<f8", (len(names),)))]
     return np.dtype([*_HEADER_FIELDS, ("names", "<u4"), *texts, *arrays], align=True)
 
@@ -187,18 +185,10 @@ CAN_TOPIC = Topic(
     "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
     + _HEADER,
 )
-CAN_FRAME = np.dtype(
-    [
-        *_HEADER_FIELDS,
-        ("id", "<u4"),
-        ("is_rtr", "u1"),
-        ("is_extended", "u1"),
-        ("is_error", "u1"),
-        ("dlc", "u1"),
-        ("data", "u1", (8,)),
-    ],
-    align=True,
-)
+_CAN_FIELDS = [
+    ("id", "<u4"), ("is_rtr", "u1"), ("is_extended", "u1"), ("is_error", "u1"), ("dlc", "u1"), ("data", "u1", (8,)),
+]  # fmt: skip
+CAN_FRAME = np.dtype([*_HEADER_FIELDS, *_CAN_FIELDS], align=True)
 
 
 def frame_array(frames: list[tuple[int, Any]]) -> np.ndarray:

@@ -88,10 +88,6 @@ def dds_type(ros_type: str) -> str:
     return f"{package}::{kind}::dds_::{name}_"
 
 
-def _mangled(name: str) -> str:
-    return name.replace("/", "%")
-
-
 def gid_of(token: str) -> bytes:
     """Of an endpoint: the hash of its liveliness token."""
     return xxh3_128_intdigest(token.encode()).to_bytes(_GID_BYTES, "little")
@@ -126,7 +122,7 @@ class Node:
     def endpoint(self, number: int, kind: str, name: str, types: tuple[str, str]) -> Endpoint:
         """The `number`th endpoint of the node; `types`: the type of ROS 2, and its hash."""
         dds, type_hash = dds_type(types[0]), types[1]
-        token = f"{self._token(number, kind)}/{_mangled(name)}/{dds}/{type_hash}/{QOS}"
+        token = f"{self._token(number, kind)}/{name.replace('/', '%')}/{dds}/{type_hash}/{QOS}"
         return Endpoint(f"{self.domain}/{name.strip('/')}/{dds}/{type_hash}", token, gid_of(token))
 
 

@@ -16,10 +16,10 @@ from jointctl.drivers.drive import Drive, DriveGroup
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
+from jointctl.tools.configuration.canopen import RPDO_BYTES, canopen_section, canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
-from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
+from jointctl.tools.session.loop_memory import quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
 
 if TYPE_CHECKING:
@@ -126,9 +126,6 @@ def require_buses(configs: Sequence[Config]) -> None:
             )
 
 
-RPDO_BYTES = 4
-
-
 def measured_delay_s(histograms: np.ndarray, rpdo_transmission_type: int, period_s: float, bit_s: float) -> float:
     """Loop delay [s] from the histograms of the first cycles; `bit_s` is the duration of one bit on the bus.
 
@@ -138,11 +135,7 @@ def measured_delay_s(histograms: np.ndarray, rpdo_transmission_type: int, period
     SYNC (transmission type n > 1: for the n-th), so that its delay is a whole number of periods.
     """
     rpdo_s = worst_frame_bits(RPDO_BYTES) * bit_s
-    path_s = (
-        quantile_s(histograms[Histogram.ROUND_TRIP], QUANTILE)
-        + quantile_s(histograms[Histogram.WORK], QUANTILE)
-        + rpdo_s
-    )
+    path_s = quantile_s(histograms[Histogram.ROUND_TRIP]) + quantile_s(histograms[Histogram.WORK]) + rpdo_s
     if rpdo_transmission_type >= EVENT_DRIVEN:
         return path_s
     periods = math.ceil(path_s / period_s)

@@ -26,7 +26,7 @@ from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event
 from jointctl.tools.session.fault_words import FAULT_TEXTS
-from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
+from jointctl.tools.session.loop_memory import quantile_s
 from jointctl.tools.session.session_drive import SessionDrive, drive_state_name, session_drive
 
 # --- What somebody who watches a run asks for, as it comes from the page: nothing in it has been checked ---
@@ -129,10 +129,15 @@ class Display(Protocol):
 
 
 class OnlyShows:
-    """The half of `Display` that a display leaves out when it neither tells events nor takes orders."""
+    """The half of `Display` that a display leaves out when it takes no orders, and opens nothing."""
+
+    def note(self, text: str) -> None:
+        """See `Display`."""
 
     def event(self, event: Event) -> None:
-        """Events are in the log."""
+        """A fault is reported when it happens, not only at the end of the run; the other events are in the log."""
+        if event.level >= ERROR:
+            self.note(event.text)
 
     def stop_request(self) -> StopRequest:
         """Nobody can ask for anything here; signals have their own way."""
@@ -146,6 +151,12 @@ class OnlyShows:
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """Nothing can be changed here."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Nothing to take away."""
 
 
 class Displays:
@@ -208,19 +219,8 @@ class PhaseLines(OnlyShows):
 
     phase = note
 
-    def event(self, event: Event) -> None:
-        """A fault is reported when it happens, not only at the end of the run; the other events are in the log."""
-        if event.level >= ERROR:
-            self.note(event.text)
-
     def show(self, snapshot: Snapshot) -> None:
         """Nothing: lines are for changes."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to take away."""
 
 
 class JointDisplay:
@@ -330,7 +330,8 @@ class EventFinder:
         state = drive_state_name(self._drive, word, drive)
         state_before = drive_state_name(self._drive, before[3], before[2]) if before[2] >= 0 else ""
         if error != before[4]:
-            events.append(self._error_event(time_ns, error))
+            level, text = (ERROR, self._drive.error_text(error)) if error else (INFO, "error code cleared")
+            events.append(Event(time_ns, level, "drive", text))
         if state != state_before:
             bad = drive in (DriveState.FAULT, DriveState.FAULT_BRAKING) or (
                 drive != DriveState.UNKNOWN and self._drive.in_fault(word)
@@ -344,19 +345,11 @@ class EventFinder:
             events.append(Event(time_ns, INFO, "loop", phase_name(phase)))
         return events
 
-    def _error_event(self, time_ns: int, error: int) -> Event:
-        if not error:
-            return Event(time_ns, INFO, "drive", "error code cleared")
-        return Event(time_ns, ERROR, "drive", self._drive.error_text(error))
-
     def _fault_text(self, code: int, drive_error: int) -> str:
         if code not in list(Fault):
             return f"fault {code}"
         words = self._fault_words(Fault(code), drive_error)
         return f"{Fault(code).name} ({code})" + (f": {words}" if words else "")
-
-
-# --- The calm panel of a run on a terminal: its picture, and the thread that draws it ---
 
 
 # --- The panel of `run`: the picture of one moment, from the newest `Snapshot`; nothing here is drawn or waits ---
@@ -421,7 +414,7 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
     record = snapshot.record
     active = AxisPhase.APPROACH <= int(record.phase) <= AxisPhase.RAMPING
     fault = int(record.fault)
-    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], QUANTILE)
+    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE])
     values: tuple[str | Text, ...] = (
         Text(phase_name(int(record.phase)), style="bold"),
         drive_state_name(session_drive(snapshot.drive), int(record.status_word), int(record.drive_state)),
@@ -516,11 +509,6 @@ class LivePanel(OnlyShows):
 
     def note(self, text: str) -> None:
         self._notes = [*self._notes, message_line(text)][-NOTES:]
-
-    def event(self, event: Event) -> None:
-        """As in `PhaseLines`."""
-        if event.level >= ERROR:
-            self.note(event.text)
 
     def phase(self, text: str) -> None:
         self._phase = text

@@ -29,7 +29,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.session.elmo_guard import GuardOrder, running_supervisor
 from jointctl.tools.session.fault_words import FaultText, fault_text
 from jointctl.tools.session.loop_handle import SILENT_S, LoopHandle
-from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
+from jointctl.tools.session.loop_memory import quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
 
 
@@ -44,10 +44,10 @@ class ElmoSession(SessionDrive):
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
         """Round trip of PX and work at their 99th percentile, and TC on the line; the drive takes it at its end."""
-        path_s = quantile_s(histograms[Histogram.ROUND_TRIP], QUANTILE)
+        path_s = quantile_s(histograms[Histogram.ROUND_TRIP])
         if math.isnan(path_s):
             return 1.0 / config.loop.rate_Hz
-        work_s = quantile_s(histograms[Histogram.WORK], QUANTILE)
+        work_s = quantile_s(histograms[Histogram.WORK])
         return path_s + work_s + command_time_s(elmo_section(config).baud_rate_bitps)
 
     def guard(self, config: Config, loop: LoopHandle) -> GuardHandle:

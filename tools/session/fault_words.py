@@ -288,12 +288,6 @@ def _word_text(value: float) -> str:
     return f"{word:04X}h, {state_text(word)}"
 
 
-def _encoder_words(encoder_error: int) -> str:
-    if encoder_error == ENCODER_RESTARTED:
-        return "the encoder node restarted"
-    return f"the encoder node's error code is {emergency_text(encoder_error)}"
-
-
 def fault_text(
     fault: Fault, value: float, drive_error: int, encoder_error: int = 0, *, two_encoders: bool = False
 ) -> FaultText:
@@ -308,8 +302,10 @@ def fault_text(
     happened = text.happened.format(value=value, torque=text_Nm(value), word=_word_text(value))
     if drive_error:
         happened += f"; the drive's error code is {emergency_text(drive_error)}"
-    if encoder_error:
-        happened += f"; {_encoder_words(encoder_error)}"
+    if encoder_error == ENCODER_RESTARTED:
+        happened += "; the encoder node restarted"
+    elif encoder_error:
+        happened += f"; the encoder node's error code is {emergency_text(encoder_error)}"
     if fault in (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED) and drive_error & 0xFF00 in _COMMUNICATION_ERRORS:
         return FaultText(
             happened,

@@ -159,12 +159,12 @@ def new_block(table: np.ndarray, port: type, arm: ArmModel | None) -> SharedBloc
 QUANTILE = 0.99  # of the times that a loop delay is made of
 
 
-def quantile_s(histogram: np.ndarray, quantile: float) -> float:
-    """Upper edge [s] of the bin that holds the quantile of one histogram row; nan when it is empty."""
+def quantile_s(histogram: np.ndarray) -> float:
+    """Upper edge [s] of the bin that holds QUANTILE of one histogram row; nan when it is empty."""
     total = int(histogram.sum())
     if total == 0:
         return math.nan
-    bin_us = int(np.searchsorted(np.cumsum(histogram), quantile * total))
+    bin_us = int(np.searchsorted(np.cumsum(histogram), QUANTILE * total))
     return (bin_us + 1) * 1e-6
 
 

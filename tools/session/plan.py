@@ -218,15 +218,13 @@ def free(config: Config) -> FreeMotion:
     return FreeMotion(config, trajectory_table(config))
 
 
-def resolve(config: Config, *, allow_low_margin: bool = False) -> RunPlan:
-    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read."""
-    return resolve_any(config, allow_low_margin=allow_low_margin)
-
-
-def resolve_any(
+def resolve(
     config: Config | ArmConfig, motion: Callable[[Config], JointMotion] = configured, *, allow_low_margin: bool = False
 ) -> RunPlan:
-    """The plan of a run of a joint or an arm; `motion` is made for each joint."""
+    """The plan of a run of a joint or an arm; `motion` is made for each joint.
+
+    `ConfigurationError` for a table that leaves the limits or cannot be read.
+    """
     if isinstance(config, Config):
         return RunPlan(config, motion(config), log_path(config), allow_low_margin)
     return resolve_arm(config, motion, allow_low_margin=allow_low_margin)

@@ -48,7 +48,7 @@ from jointctl.firmware_py.cycle import Clock, Exchange, Histogram, run_cycles, s
 from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
 from jointctl.firmware_py.schema import INT32_MAX, new
 from jointctl.firmware_py.states import DriveRequest
-from jointctl.tools.session.loop_memory import QUANTILE, SharedBlock, quantile_s
+from jointctl.tools.session.loop_memory import SharedBlock, quantile_s
 
 HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62
@@ -84,7 +84,7 @@ def held_rate_Hz(receive_share: float) -> float:
     block = SharedBlock.create(1, CanopenPort)
     try:
         run_portable_loop(_SilentBus(), block, PROBE_PERIOD_NS, 0, max_cycles=PROBE_CYCLES)
-        busy_s = sum(quantile_s(block.histograms[row], QUANTILE) for row in (Histogram.WAKE, Histogram.WORK))
+        busy_s = sum(quantile_s(block.histograms[row]) for row in (Histogram.WAKE, Histogram.WORK))
     finally:
         os.close(block.fd)
     return min(HIGHEST_RATE_HZ, (1.0 - receive_share) / busy_s)

@@ -40,7 +40,6 @@ from jointctl.tools.session.elmo_guard import GuardCall
 from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
-    from jointctl.drivers.elmo.drive import ElmoDrive
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.verbs.monitor import MonitorOptions
@@ -86,12 +85,6 @@ class Reading:
                 "text": self.text,
             }
         )  # fmt: skip
-
-
-def read_once(drive: ElmoDrive) -> Reading:
-    """Ask for everything."""
-    status, fault = drive.status()
-    return Reading(time.time(), *drive.motion(), status, fault)
 
 
 @dataclass(frozen=True)
@@ -195,7 +188,8 @@ class ElmoBench(BenchDrive):
             while not signals.count and (options.count is None or shown < options.count):
                 if until_s is not None and time.monotonic() >= until_s:
                     break
-                reading = read_once(drive)
+                status, fault = drive.status()
+                reading = Reading(time.time(), *drive.motion(), status, fault)
                 rounds += 1
                 now = (reading.position_rad, reading.status, reading.motor_fault)
                 if not (options.changes and now == last):

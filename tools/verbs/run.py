@@ -65,14 +65,14 @@ def tracked(
     """`run` from Python; `own`: the virtual joint that was started for it, and may still be starting."""
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve_any
+    from jointctl.tools.session.plan import TerminalConsent, configured, free, require_terminal, resolve
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
 
     if not (assume_yes or dry_run):
         require_terminal()
     motion = "hold" if live.hold else ""
-    plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
+    plan = resolve(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
         _displays(plan, output, run_title(config, motion), scope) as display,

@@ -582,13 +582,9 @@ class Tune:
             kept = self.folder / "tuned.toml"
             replace_file(kept, content)
             raise DataError(f"{path}: was changed during the tune, and is left as it is", f"{kept} has what was found")
-        replace_file(path, content, _require_valid)
+        replace_file(path, content, load_config)
         replace_file(self.folder / "before.toml", text.encode())
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
         write_report(self, [[".".join(one.section), one.key, one.value] for one in values])
         self.carrier.output.note(f"written: {path}; as it was: {self.folder / 'before.toml'}")
-
-
-def _require_valid(path: Path) -> None:
-    load_config(path)

@@ -206,28 +206,30 @@ def _unread_is_no_error() -> Iterator[None]:
         raise typer.Exit from None
 
 
-class Verb(TyperCommand):
-    """A flag shows no type in the help; a number whose name has a unit may be given in another one."""
+class _Page:
+    """Of help, before Typer's own class: a flag shows no type there."""
+
+    def format_help(self, *args: Any) -> None:
+        with suppress(SystemExit):  # of rich, which drops what nobody reads any more, and would end with 1
+            super().format_help(*args)  # type: ignore[misc]
+
+    def get_params(self, ctx: Any) -> Any:
+        return without_types_of_flags(super().get_params(ctx))  # type: ignore[misc]
+
+
+class Verb(_Page, TyperCommand):
+    """A number whose name has a unit may be given in another one."""
 
     def make_context(self, *args: Any, **keywords: Any) -> Any:
         """What was given to the verb; the page of help, and its end."""
         with _unread_is_no_error():
             return super().make_context(*args, **keywords)
 
-    def format_help(self, *args: Any) -> None:
-        """The page of help."""
-        with suppress(SystemExit):  # of rich, which drops what nobody reads any more, and would end with 1
-            super().format_help(*args)
-
     def make_parser(self, ctx: Any) -> Any:
         """The parser, and then the units."""
         parser = super().make_parser(ctx)
         vars(parser)["parse_args"] = partial(_with_units, parser.parse_args)
         return parser
-
-    def get_params(self, ctx: Any) -> Any:
-        """Those that a page of help shows."""
-        return without_types_of_flags(super().get_params(ctx))
 
 
 @contextmanager
@@ -239,13 +241,8 @@ def _interruption_kept() -> Iterator[None]:
         raise typer.Abort(*error.args) from None
 
 
-class Verbs(TyperGroup):
-    """A flag shows no type in the help; an interruption is one for the program, and so is a broken pipe."""
-
-    def format_help(self, *args: Any) -> None:
-        """The page of help."""
-        with suppress(SystemExit):  # as of a verb
-            super().format_help(*args)
+class Verbs(_Page, TyperGroup):
+    """An interruption is one for the program, and so is a broken pipe."""
 
     def make_context(self, *args: Any, **keywords: Any) -> Any:
         """What was given on the command line, which may be a configuration."""
@@ -259,10 +256,6 @@ class Verbs(TyperGroup):
                 return super().invoke(ctx)
             except BrokenPipeError as error:  # no stream of `Output`; Typer would end with 1, and no word
                 raise RuntimeError(str(error)) from error
-
-    def get_params(self, ctx: Any) -> Any:
-        """Those that a page of help shows."""
-        return without_types_of_flags(super().get_params(ctx))
 
 
 def without_types_of_flags(options: Any) -> Any:
