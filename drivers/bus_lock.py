@@ -35,7 +35,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from jointctl.drivers.can.open import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
@@ -97,7 +97,7 @@ _CALLERS = 64  # that are served at once; the oldest gives way
 STOP_WITHIN_S = 8.0  # how long a program may take to end after a stop, unless it says otherwise
 
 
-class BusLock:
+class BusLock(contextlib.AbstractContextManager["BusLock"]):
     """Held until `close`; `BusError` names the program that has it.  No lock where the system has no such sockets.
 
     `on_stop` is called in a thread of the lock when the user asks for a stop, once.  `remarks`: what was found and
@@ -171,9 +171,6 @@ class BusLock:
         if self.marker_fd is not None:
             self._marker.close()
             self.marker_fd = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -462,7 +459,7 @@ ARMED = (
 )
 
 
-class StopCall:
+class StopCall(contextlib.AbstractContextManager["StopCall"]):
     """Asks the program that controls the bus to stop, at once; then `end` it.  To be used in a `with` block.
 
     A program that was started before, and takes the lock of the bus later, finds the note of this stop and ends.
@@ -487,9 +484,6 @@ class StopCall:
         self._holders = lock_holders(*self._place)
         for holder in self._holders:
             holder.send("stop")
-
-    def __enter__(self) -> StopCall:
-        return self
 
     def __exit__(self, *_: object) -> None:
         for holder in self._holders:

@@ -25,14 +25,14 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -77,7 +77,6 @@ from jointctl.tools.written_file import writing
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
-    from jointctl.tools.configuration.config import Config
 
 
 # --- An MCAP file that grows chunk by chunk, from the library's records, in memory that does not grow with it ---
@@ -90,16 +89,9 @@ CHUNK_BYTES = 256 * 1024
 # records that a run keeps besides, 20 MB; an hour at 1 kHz is 1.2 GB, and the supervisor's memory must not grow with it
 IN_MEMORY = 60_000
 INDEX_IN_MEMORY = 8 * 1024  # bytes, half a minute of a run; a longer index waits in a file
-MESSAGE_HEAD = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_ns", "<u8"),
-        ("sent_ns", "<u8"),
-    ]
-)
+MESSAGE_HEAD = np.dtype([
+    ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log_ns", "<u8"), ("sent_ns", "<u8"),
+])  # fmt: skip
 BEFORE_BODY = 9  # bytes of opcode and length
 _INDEX_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 
@@ -353,7 +345,7 @@ def _clock_metadata() -> dict[str, str]:
     return {"utc": utc, "unix_ns": str(unix_ns), "monotonic_ns": str(monotonic_ns)}
 
 
-class RunLogWriter:
+class RunLogWriter(AbstractContextManager["RunLogWriter"]):
     """Writes one log; use it as a context manager, so that an exception still finishes the file.
 
     What was written is in the hands of the operating system at the latest `flush_s` later (checked at each write, so
@@ -486,9 +478,6 @@ class RunLogWriter:
                     self._mcap.finish()
                 finally:
                     self._mcap.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
         with suppress(DataError) if value is not None else nullcontext():  # what has ended the run goes before

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Column, Table
@@ -374,7 +373,7 @@ def _mark_fault(axes: np.ndarray, fault: np.ndarray, time_s: np.ndarray) -> None
     )  # fmt: skip
 
 
-class KeptRecords:
+class KeptRecords(AbstractContextManager["KeptRecords"]):
     """Takes arrays of LogRecord in order of time, gives them back as one.  The file is gone when this is closed."""
 
     def __init__(self, folder: Path, in_memory: int = IN_MEMORY) -> None:
@@ -413,8 +412,5 @@ class KeptRecords:
         with suppress(OSError):  # what is buffered for a disk that is full is of no use any more
             self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

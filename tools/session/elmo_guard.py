@@ -72,7 +72,7 @@ def guard_address(port: str) -> bytes:
     return b"\0jointctl-line-%x-%x" % (found.st_dev, found.st_rdev)
 
 
-class GuardCall:
+class GuardCall(contextlib.AbstractContextManager["GuardCall"]):
     """A call to the guard of a port; `supervisor_pid` is None where no run of ours has it, or its guard is mute."""
 
     def __init__(self, port: str, ask: str) -> None:
@@ -89,9 +89,6 @@ class GuardCall:
         message = received_line(self._socket)
         if message is not None and isinstance(message.get("supervisor_pid"), int):
             self.supervisor_pid = message["supervisor_pid"]
-
-    def __enter__(self) -> GuardCall:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._socket.close()

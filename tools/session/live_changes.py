@@ -6,9 +6,10 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -111,17 +112,13 @@ def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> 
     return constants, checked_motion(config, record, table)
 
 
-def _start_rad(record: TrajectoryConstants) -> float | None:
-    """Where a move begins, and the joint stands."""
-    moves = record.kind in (TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID)
-    return float(record.start_rad) if moves else None
-
-
 def checked_motion(config: Config, record: TrajectoryConstants, table: np.ndarray) -> str:
     """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
     peak = peak_of(record, table)
     ends = peak.position_min_rad, peak.position_max_rad
-    problems = extremes_problems(config, *ends, peak.velocity_radps, _start_rad(record))
+    moves = record.kind in (TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID)
+    start_rad = float(record.start_rad) if moves else None  # where the joint stands
+    problems = extremes_problems(config, *ends, peak.velocity_radps, start_rad)
     torque_Nm = config.joint.inertia_kgm2 * peak.acceleration_radps2
     if not torque_Nm <= config.limits.torque_max_Nm:
         problems.append(
@@ -380,7 +377,7 @@ SETTINGS_s = 0.5  # how often the page gets the state
 UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl stop` brakes it"
 
 
-class ViewerOrders:
+class ViewerOrders(AbstractContextManager["ViewerOrders"]):
     """One run.  The run log has everything in any case.
 
     A recording is a log of its own beside the run log: NAME.recording-1.mcap.
@@ -440,26 +437,17 @@ class ViewerOrders:
             how += f", incomplete: {error}"
         self._tell(INFO, f"recording {recording.path.name} ended {how}")
 
-    def keep(self, records: np.recarray) -> None:
-        """New records, as they go into the run log; a recording that cannot be written does not end the run."""
+    def keep(self, new: np.recarray | Event) -> None:
+        """New records or an event, as in the run log; a recording that cannot be written does not end the run."""
         if self._recording is None:
             return
         try:
-            self._recording.write_records(records)
+            if isinstance(new, Event):
+                self._recording.write_event(new.level, new.source, new.text, new.time_ns)
+            else:
+                self._recording.write_records(new)
         except DataError as error:
             self._end_recording(f"because of {error}")
-
-    def keep_event(self, event: Event) -> None:
-        """As `keep`, for an event."""
-        if self._recording is None:
-            return
-        try:
-            self._recording.write_event(event.level, event.source, event.text, event.time_ns)
-        except DataError as error:
-            self._end_recording(f"because of {error}")
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._end_recording("with the run")

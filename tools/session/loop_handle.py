@@ -35,7 +35,7 @@ OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the dr
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
 
-class LoopHandle:
+class LoopHandle(contextlib.AbstractContextManager["LoopHandle"]):
     """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
     `port`: record of the drive's exchange.  `tail_paths`: where the loop itself saves the ring of each axis if this
@@ -87,9 +87,6 @@ class LoopHandle:
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # keys that a terminal turns into signals are not for the loop
             )
-
-    def __enter__(self) -> LoopHandle:
-        return self
 
     def __exit__(self, *_: object) -> None:
         """A loop that still runs gets the word to switch off, and is killed only if it does not listen."""
@@ -232,7 +229,5 @@ class LoopHandle:
             with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it
                 self._process.wait(KILL_S)
             raise MotionFault(f"the loop process did nothing for {silent_s:.1f} s and was ended", self._after_end)
-        if self.block.words[Word.ENDED]:
-            return False
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         raise MotionFault(f"the loop process {how}", self._after_end)

@@ -503,7 +503,7 @@ class RunWatch:
         self.log.write_event(event.level, event.source, event.text, event.time_ns)
         if shown:
             self.display.event(event)
-        self._orders.keep_event(event)
+        self._orders.keep(event)
 
     def _tell_scope(self, level: int, text: str) -> None:
         self._tell(Event(time.monotonic_ns(), level, "scope", text))

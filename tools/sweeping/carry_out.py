@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -415,9 +415,6 @@ class MeterDisplay(OnlyShows):
             if self._advance is None:  # not before: it would paint over what the loop says while it starts
                 self._advance = self._stack.enter_context(self._output.progress(self._title, self._duration_s))
             self._advance(max(0.0, float(snapshot.record.trajectory_s)))
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: Any) -> None:
         self._stack.__exit__(*exception)
