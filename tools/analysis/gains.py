@@ -271,7 +271,7 @@ class Goals:
             f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
                 math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
             f"torque noise {text_Nm(one.noise_Nm, 2)}, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
-            f"phase margin of the gate {one.gate_deg:.1f} deg, {GRID_SPARE * self.gate_deg:.3g} and 3 % to spare wanted":
+            f"phase margin of the gate {one.gate_deg:.1f} of {GRID_SPARE * self.gate_deg:.3g} deg and 3 % to spare":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
             f"|S| of the gate {one.gate_sensitivity:.2f}, {self.gate_sensitivity / GRID_SPARE:.3g} less 3 % at most":
                 one.gate_sensitivity / self.gate_sensitivity - 1.0,

@@ -320,7 +320,7 @@ def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing(
     found = choose_gains(known(shipped("realistic", margin__min_phase_margin_deg=89.0), fit), fit.intervals())
     (name, share), *others = found.missed.items()
     assert name.startswith("phase margin of the gate")
-    assert name.endswith(" deg, 89 and 3 % to spare wanted")  # for what the grid leaves out
+    assert name.endswith(" of 89 deg and 3 % to spare")  # for what the grid leaves out
     assert 0.0 < share < 1.0
     assert not others
 
