@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from jointctl.tools.session.run_watch import RunWatch
 from jointctl.tools.session.session import Session
 from tests.unit.drivers.elmo.virtual_line import Talk
 from tests.unit.firmware_py.stub_loop import ANSWER_ns, Loop
@@ -69,16 +71,20 @@ class _BrakingLoop:
         return self.polls > 0
 
 
-@pytest.mark.parametrize("request_", [StopRequest.NONE, StopRequest.OFF])
-def test_a_stop_signal_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, request_: StopRequest) -> None:
-    class Signals:
-        request = request_
-
+@pytest.mark.parametrize("by_viewer", [False, True])
+@pytest.mark.parametrize("request_", [StopRequest.NONE, StopRequest.QUICK_STOP, StopRequest.OFF])
+def test_a_stop_is_heard_while_a_failed_supervisor_brakes(
+    virtual_config: Any, request_: StopRequest, by_viewer: bool
+) -> None:
+    """By a signal, or the second press of STOP at the page."""
+    by_signal, by_page = (StopRequest.NONE, request_) if by_viewer else (request_, StopRequest.NONE)
     session = Session.__new__(Session)
     session._config = virtual_config
     loop: Any = _BrakingLoop()
-    signals: Any = Signals()
-    session._brake(loop, signals)
+    watch = RunWatch.__new__(RunWatch)
+    watch.around = Mock(signals=Mock(request=by_signal))
+    watch.display = Mock(stop_request=lambda: by_page)
+    session._brake(loop, watch)
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
 
 

@@ -33,7 +33,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import KeptRecords, histogram_times, summarise
-from jointctl.tools.session.control import Control, StopSignals
+from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
@@ -291,13 +291,13 @@ class Session:
             self._log_end(watches, error)
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
-            self._brake(loop, signals, StopRequest.QUICK_STOP)
+            self._brake(loop, watch, StopRequest.QUICK_STOP)
             # `jointctl stop` sends such frames as well
             if not signals.commanded_ns and not self._explained_by_restart(error, loop):
                 self._log_end(watches, error)
                 raise MotionFault(error.message, error.hint) from None
         except BaseException:
-            self._brake(loop, signals)
+            self._brake(loop, watch)
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         for each in watches:
@@ -360,17 +360,17 @@ class Session:
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, error.hint) from None
 
-    def _brake(self, loop: LoopHandle, signals: StopSignals, how: StopRequest = StopRequest.RAMP) -> None:
+    def _brake(self, loop: LoopHandle, watch: RunWatch, how: StopRequest = StopRequest.RAMP) -> None:
         """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
 
-        The user may still ask for more than a ramp.
+        The user may still ask for more than a ramp, at the page, by Foxglove and ROS 2 as well.
         """
         sequence = self._config.sequence
         loop.request_stop(how)
         give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
         with contextlib.suppress(MotionFault):
             while loop.running() and time.monotonic() < give_up_s:
-                loop.request_stop(signals.request)
+                loop.request_stop(watch.stop_request())
                 loop.beat()
                 time.sleep(POLL_S)
 
