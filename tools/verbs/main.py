@@ -141,6 +141,10 @@ def _end_unexpected(error: Exception) -> NoReturn:
         Output().error(refused.message, refused.hint)
     elif isinstance(error, MemoryError):
         Output().error("there is too little memory for this", "end other programs, or give it less to do")
+    elif isinstance(error, RuntimeError) and "start new thread" in str(error):  # the only sign that Python gives of it
+        Output().error(
+            "no more threads may be started", "end other programs, or raise the limit, such as `ulimit -u 4096`"
+        )
     else:
         Output().error(
             one_line(f"a fault of jointctl itself: {type(error).__name__}: {error}"),

@@ -74,6 +74,7 @@ def test_a_stop_is_tried_all_the_same(tmp_path: Path) -> None:
         (RuntimeError("odd\x1b[2J\nsecond"), "a fault of jointctl itself: RuntimeError: odd\\u001b[2J\\nsecond"),
         (RecursionError("too deep"), "RecursionError"),
         (MemoryError(), "too little memory"),
+        (RuntimeError("can't start new thread"), "error: no more threads may be started"),
         (OSError(24, "Too many open files"), "open files: Too many open files"),
         (OSError(36, "File name too long"), "File name too long"),
         (PermissionError(13, "Permission denied"), "Permission denied"),
