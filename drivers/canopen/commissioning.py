@@ -59,6 +59,7 @@ STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the l
 STEEP_PERMILLE_PS = 1_000_000
 TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"
 LONGEST_PERIOD = 255  # of 60C2:1
+WITHOUT_6007 = "no object 6007 (abort connection option): when this computer dies, in mode"
 MAX_TORQUE, TORQUE_LIMIT = "max torque", "torque limit"
 RATED_PERMILLE = 1000.0
 ROUNDING = 1e-9  # of a quotient that should be a whole number
@@ -194,6 +195,10 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
         raise DeviceError(
             f"node {settings.node} does not support {names} (6502 = {supported:08X}h); drive.mode is {settings.mode}"
         )
+    commands_torque = [mode for mode in usable if mode not in VELOCITY_MODES]
+    if usable[0] in VELOCITY_MODES and commands_torque and not objects.has(0x6007):
+        usable = commands_torque
+        findings.remarks.append(f"a mode of torque: {WITHOUT_6007} {settings.mode} it may go on turning the joint")
     findings.mode = usable[0]
     objects.write(0x6060, 0, findings.mode, what="modes of operation")
     for _ in range(ATTEMPTS):
@@ -243,14 +248,17 @@ def _scaled_units(objects: ObjectAccess) -> list[str]:
     return found
 
 
-def require_own_loop(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """What a run needs of a drive that closes its own loop; it must not go on holding with no one watching."""
+def require_reaction(objects: ObjectAccess, settings: CanopenSettings) -> None:
+    """A drive that closes a loop of its own, also in a sweep, must not hold or turn the joint with no one watching."""
     if not objects.has(0x6007):
         raise DeviceError(
-            f"node {settings.node} has no object 6007 (abort connection option): in mode {settings.mode} it may go on "
-            "holding the joint when this computer dies",
-            'drive.mode = "cst" if it has that mode; such a drive is not enabled in this one',
+            f"node {settings.node} has {WITHOUT_6007} {settings.mode} it may go on holding or turning the joint",
+            'drive.mode = "cst" if it has that mode, `sweep --mode torque`; such a drive is not enabled in this one',
         )
+
+
+def require_own_loop(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """What else a run needs of a drive that closes its own loop."""
     if settings.torque_offset and not objects.has(0x60B2):
         raise DeviceError(
             f"node {settings.node} has no object 60B2 (torque offset), which drive.cascade.torque_offset (=true) needs",
@@ -507,6 +515,8 @@ def commission(
     disable(objects, settings, pause)
     choose_mode(objects, settings, findings, pause)
     limit_torque(objects, settings, findings)
+    if findings.mode in TARGETS:
+        require_reaction(objects, settings)
     if settings.holds_alone:
         require_own_loop(objects, settings, findings)
     if findings.mode in TARGETS:

@@ -78,11 +78,11 @@ def arm_reaction(objects: ObjectAccess, settings: CanopenSettings) -> tuple[str,
 
 # --- how fast its quick stop brakes ---
 
-QUICK_STOP_RAMPS = {1: 0x6084, 2: 0x6085, 5: 0x6084, 6: 0x6085}  # of 605A
+QUICK_STOP_RAMPS = {1: 0x6084, 2: 0x6085}  # of 605A, where 5 to 8 keep the power and are refused
 _OTHER_REACTIONS = {
     0: "takes its power at once: the joint coasts",
-    **dict.fromkeys((3, 7), "brakes at its current limit: how fast is not known"),
-    **dict.fromkeys((4, 8), "brakes at its voltage limit: how fast is not known"),
+    3: "brakes at its current limit: how fast is not known",
+    4: "brakes at its voltage limit: how fast is not known",
 }
 _OWN_UNITS = {0xFB: "maxon", 0xAB: "Copley"}  # makers whose accelerations are in other units than counts/s2
 # objects that scale accelerations, with the values that leave them in counts/s2: SI units, dimension and notation index

@@ -47,7 +47,6 @@ from jointctl.tools.configuration.sections import (
 TPDO_BYTES, RPDO_BYTES = 8, 4
 VELOCITY_RPDO_BYTES = 6  # 60FF and 607A are longer than 6071
 OFFSET_BYTES, VELOCITY_OFFSET_BYTES = 2, 4  # 60B2 in the same frame, 60B1 in one of its own
-HOLDING_OPTIONS = 5  # of 605A: from here on the drive stays in Quick Stop Active, with its power on
 CASCADE_LAWS = ("computed_torque", "flexible_joint")
 SECOND_POSITION_BYTES = 4
 TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
@@ -97,7 +96,7 @@ class CanopenSection(DriveSection):
     master_node: Node = 126  # whose heartbeat the drive watches
     boot_timeout_s: Annotated[float, between(0.0, 60.0)] = 3.0  # for the first answer, and for leaving Not Ready
     sdo_timeout_s: Annotated[float, between(0.02, 10.0)] | None = None  # of one SDO request (three times); None = 0.3 s
-    quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
+    quick_stop_option: Annotated[int, between(0, 4)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
     # 1 = the torque is taken over at the next SYNC, 254/255 = at once
     rpdo_transmission_type: Annotated[int, between(0, 255)] = 1
     temperature_object: ObjectPlace | None = None  # the drive's own, "2103"; read once a second, to be shown and logged
@@ -417,11 +416,6 @@ def cascade_problems(config: Config) -> list[str]:
         )
     if (cascade.velocity_gain_Nmspr is None) != (cascade.velocity_integral_Nmprad is None):
         found.append("drive.cascade.velocity_gain_Nmspr and velocity_integral_Nmprad must be given together")
-    if drive.quick_stop_option >= HOLDING_OPTIONS:
-        found.append(
-            f"drive.quick_stop_option (={drive.quick_stop_option}) must be in [0..{HOLDING_OPTIONS - 1}] with "
-            f"drive.mode (={mode}): the drive would stay in Quick Stop Active and hold the joint with no one watching"
-        )
     second = config.joint_encoder
     if second is not None and second.law == "joint_encoder" and control.kind != "flexible_joint":
         found.append(

@@ -6,21 +6,24 @@ import contextlib
 import io
 import json
 import math
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import signal
 
-from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.drivers.errors import ConfigurationError, MarginError, UsageError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_text, require_cascade
 from jointctl.tools.configuration.canopen import CanopenSection, cyclic_bus_load, rpdo_bytes
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
-from tests.configurations import changed, load, problems, shipped
+from tests.configurations import changed, load, problems, shipped, written
 from tests.places import CONFIGS
 
 CSP = (CONFIGS / "csp.toml").read_text()
@@ -194,6 +197,15 @@ def test_the_frames_of_a_cycle(mode: str, cascade: dict[str, Any], lengths: tupl
     config = own_loop(mode, **cascade)
     assert rpdo_bytes(drive_of(config)) == lengths
     assert cyclic_bus_load(config) > cyclic_bus_load(shipped("virtual"))
+
+
+@pytest.mark.parametrize("base", ["csp", "virtual"])
+@pytest.mark.parametrize(("option", "refused"), [(4, False), (5, True), (8, True)])
+def test_a_quick_stop_that_keeps_the_power_is_refused(tmp_path: Path, base: str, option: int, refused: bool) -> None:
+    """Its last controlword may enable such a drive again: with the computer dead the virtual one kept its torque."""
+    path = written(tmp_path / "joint.toml", base, drive__quick_stop_option=option)
+    with pytest.raises(ConfigurationError, match=r"must be in \[0..4\]") if refused else nullcontext():
+        assert load_config(path).drive.quick_stop_option == option  # type: ignore[attr-defined]
 
 
 # --- combinations that cannot be ---

@@ -91,7 +91,7 @@ OWN_LOOP: dict[str, Any] = {"mode": "csp", "holds_alone": True, "torque_offset":
 
 @pytest.mark.parametrize(
     ("index", "words"),
-    [(0x6007, "object 6007 .* may go on holding the joint when this computer dies"), (0x60B2, "object 60B2 .*offset")],
+    [(0x6007, "object 6007 .* dies, in mode csp it may go on holding or turning"), (0x60B2, "object 60B2 .*offset")],
 )
 def test_a_drive_that_lacks_what_a_loop_of_its_own_needs_is_refused(lacking: Any, index: int, words: str) -> None:
     with pytest.raises(DeviceError, match=words):
@@ -100,6 +100,21 @@ def test_a_drive_that_lacks_what_a_loop_of_its_own_needs_is_refused(lacking: Any
 
 def test_its_twin_in_torque_mode_the_same_drive_is_accepted(lacking: Any) -> None:
     assert lacking((0x6007, None), (0x60B2, None)).mode == "cyclic_sync_torque"
+
+
+@pytest.mark.parametrize("mode", ["csv", "pv"])
+def test_nor_is_it_used_in_a_velocity_mode_for_a_sweep(lacking: Any, mode: str) -> None:
+    """It was: with the computer dead a drive that merely leaves operational may go on turning."""
+    with pytest.raises(DeviceError, match=f"object 6007 .* in mode {mode} it may go on holding or turning"):
+        lacking((0x6007, None), mode=mode)
+
+
+@pytest.mark.parametrize("without", [0x6007, 0x60B2])
+def test_where_the_mode_is_open_a_sweep_takes_torque_then(lacking: Any, without: int) -> None:
+    report = lacking((without, None), mode="velocity or torque")
+    refused = without == 0x6007
+    assert report.mode == ("cyclic_sync_torque" if refused else "cyclic_sync_velocity")
+    assert any("a mode of torque: no object 6007" in line for line in report.remarks) is refused
 
 
 def test_without_60b1_6065_and_a_torque_mode_csp_goes_on_with_remarks(lacking: Any, commission: Any) -> None:

@@ -572,7 +572,7 @@ def judged(settings: Any, held: dict[tuple[int, int], int], **changes: Any) -> t
 
 @pytest.mark.parametrize(
     ("option", "value", "radps2"),
-    [(1, 0x6084, 400_000), (2, 0x6085, 1_000_000), (5, 0x6084, 400_000), (6, 0x6085, 1_000_000)],
+    [(1, 0x6084, 400_000), (2, 0x6085, 1_000_000)],
 )
 @pytest.mark.parametrize(("mode", "hedged"), [("cst", True), ("auto", True), ("csv", False), ("csp", False)])
 def test_the_ramp_is_that_which_605a_names(
@@ -634,7 +634,7 @@ def test_it_is_compared_with_the_loops_stop_and_the_limits(
         (FAST | {(0x6085, 0): 0}, {}, "6085 is 0, how fast it brakes is not known"),
         (FAST, {"quick_stop_option": 0}, "takes its power at once: the joint coasts"),
         (FAST, {"quick_stop_option": 3}, "brakes at its current limit: how fast is not known"),
-        (FAST, {"quick_stop_option": 8}, "brakes at its voltage limit: how fast is not known"),
+        (FAST, {"quick_stop_option": 4}, "brakes at its voltage limit: how fast is not known"),
         (FAST, {"quick_stop_option": 1, "mode": "pv"}, "which a run makes steeper than its motions where it needs it"),
         (FAST, {"velocity_unit": "r/min"}, "in a unit that is not known: drive.velocity_unit is r/min"),
         (FAST, {"vendor_id": 0xFB}, "in a unit that is not known: maxon has a unit of its own"),
