@@ -71,20 +71,20 @@ class _BrakingLoop:
         return self.polls > 0
 
 
-@pytest.mark.parametrize("by_viewer", [False, True])
+@pytest.mark.parametrize("by", ["a signal", "a signal, behind a broken display", "a viewer"])
 @pytest.mark.parametrize("request_", [StopRequest.NONE, StopRequest.QUICK_STOP, StopRequest.OFF])
-def test_a_stop_is_heard_while_a_failed_supervisor_brakes(
-    virtual_config: Any, request_: StopRequest, by_viewer: bool
-) -> None:
+def test_a_stop_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, request_: StopRequest, by: str) -> None:
     """By a signal, or the second press of STOP at the page."""
-    by_signal, by_page = (StopRequest.NONE, request_) if by_viewer else (request_, StopRequest.NONE)
+    by_signal, by_page = (StopRequest.NONE, request_) if by == "a viewer" else (request_, StopRequest.NONE)
+    broken = OSError("no page") if "broken" in by else None
     session = Session.__new__(Session)
     session._config = virtual_config
     loop: Any = _BrakingLoop()
     watch = RunWatch.__new__(RunWatch)
     watch.around = Mock(signals=Mock(request=by_signal))
-    watch.display = Mock(stop_request=lambda: by_page)
+    watch.display = Mock(stop_request=Mock(return_value=by_page, side_effect=broken))
     session._brake(loop, watch)
+    assert loop.polls == 0, "it is braked to the end"
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
 
 

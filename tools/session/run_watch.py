@@ -369,14 +369,10 @@ class RunWatch:
         """Name of the signal, or of the viewer, that asked for the end of the run; "" if nobody did."""
         return self.around.signals.name or self._stopped_by_viewer
 
-    def stop_request(self) -> StopRequest:
-        """The strongest stop of the user, by a signal, `jointctl stop` or a viewer."""
-        return max(self.around.signals.request, self.display.stop_request())
-
     def poll(self) -> None:
         """One look at everything; an exception ends the run."""
         self.loop.beat()
-        request = self.stop_request()
+        request = max(self.around.signals.request, self.display.stop_request())
         if request is not StopRequest.NONE:
             self.loop.request_stop(request)
         self.take_records()

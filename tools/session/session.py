@@ -370,7 +370,9 @@ class Session:
         give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
         with contextlib.suppress(MotionFault):
             while loop.running() and time.monotonic() < give_up_s:
-                loop.request_stop(watch.stop_request())
+                loop.request_stop(watch.around.signals.request)
+                with contextlib.suppress(Exception):  # of a display that cannot go on either
+                    loop.request_stop(watch.display.stop_request())
                 loop.beat()
                 time.sleep(POLL_S)
 
