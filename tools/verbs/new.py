@@ -48,7 +48,7 @@ def new(
         str | None,
         typer.Option(
             "--from",
-            help="name of the shipped configuration",
+            help="name of a shipped configuration, or a file of yours",
             show_default="elmo_gold_can",
             autocompletion=shipped_configurations,
         ),
@@ -81,6 +81,8 @@ def new(
     from jointctl.tools.inspection.first_files import filled
 
     source = shipped_config("elmo_gold_can" if shipped is None else shipped)
+    if not source.is_file() and shipped is not None and shipped.endswith(".toml") and os.path.isfile(shipped):
+        source = Path(shipped)
     text = read_text(source)
     if "[arm]" in text.splitlines():
         raise UsageError(

@@ -297,3 +297,15 @@ def test_what_an_epos4_counts_in_and_lacks_is_said(tmp_path: Path, joint: Device
     assert found.known["drive", "rated_torque_Nm"][0] == pytest.approx(0.0665 if maxon else 0.5)
     for words in ('rated_torque_unit = "uNm"', "no 6072 (max torque): name the maker's own limit"):
         assert any(words in remark for remark in found.remarks) is maxon
+
+
+def test_a_file_of_ones_own_is_copied_by_a_relative_path_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was looked for among the shipped ones, unless its path was absolute."""
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "own.toml"
+    own.write_text("# mine\n")
+    for k, name in enumerate(("own.toml", "./own.toml", str(own))):
+        new(Path(f"copy{k}.toml"), output()[0], shipped=name)
+        assert Path(f"copy{k}.toml").read_text() == "# mine\n"
+    with pytest.raises(ConfigurationError, match="no such file"):
+        new(Path("copy.toml"), output()[0], shipped="none_such")
