@@ -81,7 +81,7 @@ def new(
     from jointctl.tools.inspection.first_files import filled
 
     source = shipped_config("elmo_gold_can" if shipped is None else shipped)
-    if not source.is_file() and shipped is not None and shipped.endswith(".toml") and os.path.isfile(shipped):
+    if not os.path.isfile(source) and shipped is not None and shipped.endswith(".toml") and os.path.isfile(shipped):
         source = Path(shipped)
     text = read_text(source)
     if "[arm]" in text.splitlines():
