@@ -24,7 +24,6 @@ import stat
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -558,9 +557,7 @@ class VirtualBusHub:
     def __enter__(self) -> VirtualBusHub:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     @property

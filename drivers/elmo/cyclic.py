@@ -137,7 +137,6 @@ class ElmoPort:
     lost: i8
     unexpected: i8
     refused: i8
-    last_error: i4  # error byte of the last refusal
     resyncs: i8
     send_failures: i8
     consecutive_failures: i4
@@ -320,7 +319,6 @@ def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
     length = port.line_length - start
     if length >= 1 and length <= 2 and port.line[port.line_length - 1] == QUESTION_MARK:
         port.refused += 1
-        port.last_error = port.line[start] if length == 2 else 0
         return False
     return _take_value(port, sample, question, start, now_ns, slot)
 

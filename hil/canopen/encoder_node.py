@@ -41,7 +41,6 @@ def restart_encoder(node: EncoderNode) -> None:
     node.heartbeat_due_ns = 0
     node.tpdo_due_ns = 0
     node.syncs = 0
-    node.resets += 1
 
 
 @kernel

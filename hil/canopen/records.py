@@ -71,7 +71,6 @@ class EncoderNode:
     heartbeat_due_ns: i8
     tpdo_due_ns: i8
     syncs: i4
-    resets: i8  # how often the defaults were restored
     sent_error: i4  # EMCY error code that the bus knows of
     # faults
     error_code: i4  # EMCY error code of what is wrong; 0 = nothing

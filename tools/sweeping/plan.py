@@ -82,10 +82,6 @@ class Stroke:
     pitch_rad: float  # from the beginning of one window to that of the next
     length_rad: float  # of the whole stroke, ramps included
 
-    @property
-    def measured_s(self) -> float:
-        return self.strokes * self.teeth * self.window_rad / self.speed_radps
-
 
 @dataclass(frozen=True)
 class Window:

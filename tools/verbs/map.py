@@ -92,8 +92,6 @@ def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:
     second = config.joint_encoder
     if second is not None and second.law == "joint_encoder":
         position, other = other, position
-    elif second is None and config.encoder.side == "joint":
-        other = None
     # without a reducer the joint is one mass
     motor_kgm2 = config.joint.inertia_kgm2 if config.reducer is None else config.reducer.motor_inertia_kgm2
     return MapRun(
