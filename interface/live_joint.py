@@ -24,7 +24,7 @@ from jointctl.tools.scoping.remote import remote
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
-from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
+from jointctl.tools.session.display import OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loop_memory import RING_RECORDS
 from jointctl.tools.session.plan import FreeMotion, resolve
@@ -77,12 +77,6 @@ class _ProgramDisplay(OnlyShows):
 
     def note(self, text: str) -> None:
         self.notes.append(text)
-
-    def phase(self, text: str) -> None:
-        """See `Display`."""
-
-    def show(self, snapshot: Snapshot) -> None:
-        """See `Display`."""
 
     def requests(self) -> Sequence[ViewerRequest]:
         self._stop_if_over()

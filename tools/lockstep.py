@@ -165,14 +165,11 @@ class SteppedRun:
             count = min(cycles, most)
             if self._words[_HEAD] + count * axes - self._taken > len(self._ring):
                 self._keep()
-            if self._moving():
+            if self._phases[0] != _FINISHED or (self._phases != _FINISHED).any():
                 self._part[:] = self.now_ns, count
                 self._carry_out()
             self.now_ns += count * self._period_ns
             cycles -= count
-
-    def _moving(self) -> bool:
-        return self._phases[0] != _FINISHED or bool((self._phases != _FINISHED).any())
 
     def newest(self, axis: int = 0) -> Any:
         """The newest log record of an axis, a structured scalar that the next step may change."""

@@ -390,10 +390,6 @@ def cascade_margins(config: Config, delay_s: float) -> list[LoopMargin]:
     ]
 
 
-def _corrects_twist(config: Config) -> bool:
-    return config.control.kind == "flexible_joint" and encoders_of_law(config) == Encoders.BOTH
-
-
 def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) -> list[LoopMargin]:
     """Of one joint; None is a rigid one."""
     cascade, kind = cascade_of(config), config.drive.own_loop()
@@ -421,7 +417,8 @@ def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) ->
     if cascade.position_gain_ps is not None:
         position = cascade.position_gain_ps / s * closed * (fed / own) * np.exp(-s * late_s)
         found.append(_margin("position loop", omega, position, all(loop.stable for loop in found)))
-        if kind is CommandKind.POSITION and joint is not None and _corrects_twist(config):
+        corrects_twist = config.control.kind == "flexible_joint" and encoders_of_law(config) == Encoders.BOTH
+        if kind is CommandKind.POSITION and joint is not None and corrects_twist:
             twist = shafts["joint"] / shafts["motor"] - 1.0  # of the link against a motor that follows its target
             late = np.exp(-s * (delay_s + 1.0 / config.loop.rate_Hz))  # the drive goes to a target within a period
             correction = config.control.twist_radps / (s + config.control.twist_radps) * twist * late

@@ -8,7 +8,16 @@ import math
 from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.sections import Encoder, Friction, FrictionDirection, Reducer, ReducerMap, Trajectory
+from jointctl.tools.configuration.sections import (
+    Encoder,
+    Friction,
+    FrictionAngle,
+    FrictionDirection,
+    Reducer,
+    ReducerMap,
+    Ripple,
+    Trajectory,
+)
 
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
@@ -329,17 +338,22 @@ def _room_problems(config: Config, low_rad: float, high_rad: float, start_rad: f
     return found
 
 
+def _mounting_problems(
+    section: str, made: ReducerMap | Ripple | FrictionAngle, encoder: Encoder, why: str
+) -> list[str]:
+    return [
+        f"{section}.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): {why}"
+        for key in ("direction", "zero_counts")
+        if getattr(made, key) not in (None, getattr(encoder, key))  # None: not checked
+    ]
+
+
 def _map_problems(config: Config, made: ReducerMap) -> list[str]:
     """A map belongs to one mounting of the motor's encoder, and its lists to each other."""
     encoder = config.encoder
     if encoder.side != "motor":
         return ['[reducer.map] needs encoder.side = "motor": it is a map of the motor angle']
-    found = [
-        f"reducer.map.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
-        "the map was made for another mounting; make a new one"
-        for key in ("direction", "zero_counts")
-        if getattr(made, key) != getattr(encoder, key)
-    ]
+    found = _mounting_problems("reducer.map", made, encoder, "the map was made for another mounting; make a new one")
     for name, unit in (("kinematic_error", "rad"), ("torque_ripple", "Nm")):
         counts = [len(getattr(made, f"{name}_{rest}")) for rest in (unit, "per_motor_turn", "phase_rad")]
         if len(set(counts)) > 1:
@@ -371,12 +385,8 @@ def _ripple_problems(config: Config) -> list[str]:
     made, encoder = config.ripple, config.encoder
     if made is None:
         return []
-    found = [
-        f"ripple.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
-        "it was measured with another mounting; `jointctl map` measures anew"
-        for key in ("direction", "zero_counts")
-        if getattr(made, key) != getattr(encoder, key)
-    ]
+    why = "it was measured with another mounting; `jointctl map` measures anew"
+    found = _mounting_problems("ripple", made, encoder, why)
     counts = [len(values) for values in (made.torque_Nm, made.per_motor_turn, made.phase_rad)]
     if len(set(counts)) > 1:
         given = ", ".join(map(str, counts))
@@ -451,13 +461,7 @@ def _angle_problems(section: str, friction: Friction, encoder: Encoder) -> list[
         found.append(f"{section}.angle.share, per_motor_turn and phase_rad (={given}) must be equally many numbers")
     if not sum(map(abs, made.share)) <= LARGEST_SHARE:
         found.append(f"{section}.angle.share (={list(made.share)}) must add up to {LARGEST_SHARE:g} at most, unsigned")
-    found += [
-        f"{section}.angle.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
-        "it was identified with another mounting"
-        for key in ("direction", "zero_counts")
-        if getattr(made, key) not in (None, getattr(encoder, key))
-    ]
-    return found
+    return found + _mounting_problems(f"{section}.angle", made, encoder, "it was identified with another mounting")
 
 
 def _shape_problems(section: str, friction: Friction) -> list[str]:

@@ -46,7 +46,6 @@ from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.analysis.arm_check import pose_models
 from jointctl.tools.configuration.arm import ArmConfig
-from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.experiments.fault_scenarios import (
     LATE_CAUSES,
@@ -76,6 +75,7 @@ from jointctl.tools.experiments.judge import (
     causes_of,
     fault_row_of,
     friction_floor_Nm,
+    largest_drive_Nm,
     magnitude_of,
     reaction_s,
     require_joint_fits,
@@ -287,7 +287,7 @@ def envelopes(
     arm, touching = joints.arm, scenario.touching(joints.arm.joints)
     loads = masses.gravity_Nm + [magnitude_of(joint.events, FaultKind.LOAD_JUMP) for joint in scenario.joints]
     pushes = loads + [sum(joint.plant["torque_ripple_Nm"]) for joint in scenario.joints]
-    pushes += [_drive_Nm(config) for config in arm.joints]
+    pushes += [largest_drive_Nm(config) for config in arm.joints]
     push = masses.inverse @ pushes
     speed_limits = np.array([config.limits.velocity_max_radps for config in arm.joints])
     waits = np.array([reaction_s(config, events) for config, events in zip(arm.joints, touching, strict=True)])
@@ -323,12 +323,6 @@ def envelopes(
     return found
 
 
-def _drive_Nm(config: Config) -> float:
-    section = canopen_section(config)
-    share = 1e-3 * (section.max_torque_permille or 1000)
-    return share * (section.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
-
-
 def _misread(
     config: Config, scenario: ArmScenario, constants: np.recarray, axis: int, way: float
 ) -> tuple[float, float]:
@@ -346,7 +340,7 @@ def _misread(
             friction, limits = constants.law.friction, constants.limits
             viscous = min(friction.positive.viscous_Nmspr, friction.negative.viscous_Nmspr)
             blind = float(limits.frozen_torque_Nm / (viscous * config.joint.reduction_ratio))
-            blind += _drive_Nm(config) / config.joint.inertia_kgm2 * limits.frozen_cycles / config.loop.rate_Hz
+            blind += largest_drive_Nm(config) / config.joint.inertia_kgm2 * limits.frozen_cycles / config.loop.rate_Hz
             wrong += BLIND_RAD * blind / BLIND_RADPS
             faster += blind
     return wrong, faster

@@ -154,6 +154,13 @@ def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
     return config.joint.reduction_ratio * min(curves) * (1.0 - virtual.friction_ripple)
 
 
+def largest_drive_Nm(config: Config) -> float:
+    """At the joint: what the drive gives at most."""
+    section = canopen_section(config)
+    share = 1e-3 * (section.max_torque_permille or 1000)
+    return share * (section.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+
+
 def envelope(
     config: Config, scenario: Scenario, constants: AxisConstants, quick_stop_radps2: float = math.inf,
     reached_radps: float = math.inf,
@@ -166,8 +173,7 @@ def envelope(
     inertia = scenario.plant["inertia_kgm2"]
     ripple = sum(scenario.plant["torque_ripple_Nm"])
     load = magnitude_of(events, FaultKind.LOAD_JUMP)
-    share = 1e-3 * (canopen_section(config).max_torque_permille or 1000)
-    drive_Nm = share * (canopen_section(config).rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+    drive_Nm = largest_drive_Nm(config)
     constant_Nm = load_Nm(config)
     floor = _friction_floor_Nm(config, scenario) - ripple - constant_Nm
     wait_s = reaction_s(config, events)

@@ -168,13 +168,11 @@ class _Collector:
                     body = data[at + MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
                     self.events.append(Event(*(older_event_from_body if self.older else event_from_body)(body)))
             elif opcode == Opcode.CHANNEL:
-                self._take_channel(Channel.read(_stream(data, at, length)))
+                declared = Channel.read(_stream(data, at, length))
+                self._topics[declared.id] = declared.topic
             elif opcode == Opcode.SCHEMA:
                 self._take_schema(Schema.read(_stream(data, at, length)))
             at += 9 + length
-
-    def _take_channel(self, channel: Channel) -> None:
-        self._topics[channel.id] = channel.topic
 
     def _take_schema(self, schema: Schema) -> None:
         if schema.name == RECORD_TOPIC.schema and schema.data == OLDER_RECORD_DEFINITION.encode():

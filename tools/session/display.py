@@ -129,9 +129,15 @@ class Display(Protocol):
 
 
 class OnlyShows:
-    """The half of `Display` that a display leaves out when it takes no orders, and opens nothing."""
+    """What a display leaves out of `Display` when it is not told, takes no orders, and opens nothing."""
 
     def note(self, text: str) -> None:
+        """See `Display`."""
+
+    def phase(self, text: str) -> None:
+        """See `Display`."""
+
+    def show(self, snapshot: Snapshot) -> None:
         """See `Display`."""
 
     def event(self, event: Event) -> None:
@@ -218,9 +224,6 @@ class PhaseLines(OnlyShows):
             self._output.note(f"  {text}")
 
     phase = note
-
-    def show(self, snapshot: Snapshot) -> None:
-        """Nothing: lines are for changes."""
 
 
 class JointDisplay:

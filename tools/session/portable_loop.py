@@ -183,7 +183,10 @@ class PortableExchange:
             arrived_ns = time.monotonic_ns()
             if answer is None or (self._accept(answer, arrived_ns) and not owed and not self._owed()):
                 break  # time-out, failure, or the sample
-        self._note_cycle()
+        for port, sample, _ in self._axes:
+            port.consecutive_failures = port.consecutive_failures + 1 if self._failed else 0
+            sample.bus_errors = port.consecutive_failures
+        self._failed = False
         return arrived_ns - started_ns
 
     def _owed(self) -> bool:
@@ -191,12 +194,6 @@ class PortableExchange:
 
     def _begin(self) -> int:
         return int(min([begin_cycle(port, self._frames) for port, _, _ in self._axes]))
-
-    def _note_cycle(self) -> None:
-        for port, sample, _ in self._axes:
-            port.consecutive_failures = port.consecutive_failures + 1 if self._failed else 0
-            sample.bus_errors = port.consecutive_failures
-        self._failed = False
 
     def send(self, link: None, samples: np.ndarray, commands: np.ndarray) -> int:
         """Send the RPDO of each drive; a failure counts in the next cycle."""

@@ -168,9 +168,6 @@ class _AxisPoints:
         return SetPointError(f"{self.name}: {text}" if self.name else text, hint)
 
     def _refusal(self, problem: SetPointProblem, point: _Point, before: _Point) -> SetPointError:
-        return self.error(*self._words(problem, point, before))
-
-    def _words(self, problem: SetPointProblem, point: _Point, before: _Point) -> tuple[str, str]:
         """Message and hint: the value and what is allowed, and the key that it comes from."""
         limits, stream = self._limits, self._constants
         low, high, top = (float(limits[key]) for key in ("position_min_rad", "position_max_rad", "velocity_max_radps"))
@@ -210,7 +207,7 @@ class _AxisPoints:
                 "limits.position_*, sequence.brake_radps2",
             ),
         }  # fmt: skip
-        return texts[problem]
+        return self.error(*texts[problem])
 
 
 class SetPointStream:

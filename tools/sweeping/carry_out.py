@@ -395,17 +395,12 @@ def sweep_run(swept: SweepPass, *, allow_low_margin: bool = False) -> RunPlan:
 
 
 class MeterDisplay(OnlyShows):
-    """Gives the records of a pass to the meter, and its progress to the terminal."""
+    """Gives the records of a pass to the meter, and its progress to the terminal; the lines of the run say the rest."""
 
     def __init__(self, meter: SweepMeter, output: Output, title: str, duration_s: float) -> None:
         self._meter, self._output, self._title, self._duration_s = meter, output, title, duration_s
         self._stack = contextlib.ExitStack()
         self._advance: Advance | None = None
-
-    def note(self, text: str) -> None:
-        """The lines of the run say it."""
-
-    phase = note
 
     def show(self, snapshot: Snapshot) -> None:
         """See `Display`; `DataError` where the data cannot be written: the run is over."""

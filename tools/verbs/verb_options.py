@@ -214,7 +214,11 @@ class _Page:
             super().format_help(*args)  # type: ignore[misc]
 
     def get_params(self, ctx: Any) -> Any:
-        return without_types_of_flags(super().get_params(ctx))  # type: ignore[misc]
+        options = super().get_params(ctx)  # type: ignore[misc]
+        for option in options:
+            if getattr(option, "is_flag", False) and option.metavar is None:
+                option.metavar = ""
+        return options
 
 
 class Verb(_Page, TyperCommand):
@@ -256,14 +260,6 @@ class Verbs(_Page, TyperGroup):
                 return super().invoke(ctx)
             except BrokenPipeError as error:  # no stream of `Output`; Typer would end with 1, and no word
                 raise RuntimeError(str(error)) from error
-
-
-def without_types_of_flags(options: Any) -> Any:
-    """The same: where nothing can be given there is no word for it."""
-    for option in options:
-        if getattr(option, "is_flag", False) and option.metavar is None:
-            option.metavar = ""
-    return options
 
 
 # --- Parameters that several options build ---
