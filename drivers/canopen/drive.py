@@ -243,12 +243,8 @@ class CanopenDrive:
         findings.remarks += remarks
         self._findings = findings
         second = findings.second
-        start_rad = start_position_rad(
-            self._settings,
-            findings.start_counts,
-            second.start_counts if second is not None else 0,
-            second.range_counts if second is not None else DRIVE_RANGE_COUNTS,
-        )
+        of_second = (second.start_counts, second.range_counts) if second is not None else (0, DRIVE_RANGE_COUNTS)
+        start_rad = start_position_rad(self._settings, findings.start_counts, *of_second)
         return CommissioningReport(
             identity=findings.identity,
             mode=findings.settings["mode"],

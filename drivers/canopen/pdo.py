@@ -159,12 +159,9 @@ def read_map(objects: ObjectAccess, base: int) -> PdoMap:
         raw = objects.read(mapping, position, what=f"{what} mapping entry {position}") & 0xFFFFFFFF
         name = _NAMES.get(raw, "dummy" if raw >> 16 < DUMMIES else "object")
         entries.append(MappedObject(raw >> 16, raw >> 8 & 0xFF, raw & 0xFF, name))
-    return PdoMap(
-        base,
-        objects.read(base, 1, what=f"{what} COB-ID") & 0xFFFFFFFF,
-        objects.read(base, 2, what=f"{what} transmission type") & 0xFF,
-        tuple(entries),
-    )
+    cob_id = objects.read(base, 1, what=f"{what} COB-ID") & 0xFFFFFFFF
+    transmission_type = objects.read(base, 2, what=f"{what} transmission type") & 0xFF
+    return PdoMap(base, cob_id, transmission_type, tuple(entries))
 
 
 def fill_of(rpdo: PdoMap, target: MappedObject, mode: int, max_permille: int) -> bytes:

@@ -173,12 +173,8 @@ def wrong_kind(path: Path, kind: object, wanted: str, hint: str = "") -> Configu
 def require_simulated(config: Config, what: str) -> None:
     """`ConfigurationError` where the joint can be simulated in real time only."""
     if not config.drive.simulated:
-        raise wrong_kind(
-            config.path,
-            config.drive.kind,
-            f'"canopen" for {what}',
-            "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`",
-        )
+        hint = "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`"
+        raise wrong_kind(config.path, config.drive.kind, f'"canopen" for {what}', hint)
 
 
 def require_torque(config: Config, what: str) -> None:

@@ -291,14 +291,9 @@ def _simulation_row(made: PaperRun, name: str) -> PaperRow:
     estimate = friction_estimate(made.run, virtual.friction_positive_scale, virtual.friction_negative_scale)
     peak = float(np.max(np.abs(made.run.log.error_rad[made.run.tracking]))) * 1e3
     rmse = error_figures(made.run, AFTER_s).rmse_mrad
-    return PaperRow(
-        name,
-        "|e| < 2",
-        "peak 1.5..1.9, RMSE 0.10..0.13, corr >= 0.99, residual 12..17 %",
-        f"peak {peak:.2f}, RMSE {rmse:.3f}, corr {estimate.correlation:.3f}, residual {estimate.residual:.0%}",
-        "",
-        "the peak is the first instant: the joint starts at rest",
-    )
+    reference = "peak 1.5..1.9, RMSE 0.10..0.13, corr >= 0.99, residual 12..17 %"
+    ours = f"peak {peak:.2f}, RMSE {rmse:.3f}, corr {estimate.correlation:.3f}, residual {estimate.residual:.0%}"
+    return PaperRow(name, "|e| < 2", reference, ours, "", "the peak is the first instant: the joint starts at rest")
 
 
 def identification_rows(found: PaperIdentification | None) -> list[PaperRow]:
@@ -306,24 +301,13 @@ def identification_rows(found: PaperIdentification | None) -> list[PaperRow]:
     if found is None:
         return []
     note = "synthetic sweep of Table 3 with noise 0.0046 Nm"
+    constant = f"0.06 is what a Coulomb constant alone gives ({found.coulomb_rmse_Nm:.4f})"
+    compared = "curves are compared, not parameters: ws is barely identifiable"
+    stribeck, curve = f"{found.stribeck_rmse_Nm:.4f}", f"{found.curve_error_Nm:.4f}"
     return [
         PaperRow("4.1, Fig. 7: proposed model, RMSE [Nm]", "0.0046", "0.00442", f"{found.rmse_Nm:.5f}", "", note),
-        PaperRow(
-            "4.1, Fig. 7: Stribeck only, RMSE [Nm]",
-            "0.0632",
-            "0.0170",
-            f"{found.stribeck_rmse_Nm:.4f}",
-            "",
-            f"0.06 is what a Coulomb constant alone gives ({found.coulomb_rmse_Nm:.4f})",
-        ),
-        PaperRow(
-            "Table 3: greatest deviation of the curve [Nm]",
-            "-",
-            "-",
-            f"{found.curve_error_Nm:.4f}",
-            "",
-            "curves are compared, not parameters: ws is barely identifiable",
-        ),
+        PaperRow("4.1, Fig. 7: Stribeck only, RMSE [Nm]", "0.0632", "0.0170", stribeck, "", constant),
+        PaperRow("Table 3: greatest deviation of the curve [Nm]", "-", "-", curve, "", compared),
     ]
 
 
@@ -331,25 +315,13 @@ def paper_rows(runs: Runs, identification: PaperIdentification | None) -> list[P
     rows = identification_rows(identification)
     rows.append(_simulation_row(runs["4.2 more friction"], "4.2, Fig. 8: friction 10 % above the model"))
     rows.append(_simulation_row(runs["4.2 less friction"], "4.2: friction 10 % below the model"))
-    exact = error_figures(runs["exact model"].run, AFTER_s)
-    rows.append(
-        PaperRow(
-            "exact model, desired feed-forward, ideal", "-", "< 0.01", f"{exact.peak_mrad:.4f}", "", "no friction error"
-        )
-    )
+    exact = f"{error_figures(runs['exact model'].run, AFTER_s).peak_mrad:.4f}"
+    rows.append(PaperRow("exact model, desired feed-forward, ideal", "-", "< 0.01", exact, "", "no friction error"))
     for key, name, paper, reference, precise, note in _R1_ROWS:
         other = _range(runs[precise]) if precise else ""
         rows.append(PaperRow(name, paper, reference, _range(runs[key]), other, note))
-    rows.append(
-        PaperRow(
-            "15 neurons against one integrator, R1",
-            "-",
-            "differ < 0.01",
-            f"{network_difference_mrad(runs):.4f}",
-            "",
-            "with b = 5 the network is one integrator",
-        )
-    )
+    apart, why = f"{network_difference_mrad(runs):.4f}", "with b = 5 the network is one integrator"
+    rows.append(PaperRow("15 neurons against one integrator, R1", "-", "differ < 0.01", apart, "", why))
     return rows
 
 

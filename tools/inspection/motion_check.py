@@ -444,13 +444,8 @@ def _encoders(config: Config, motion: Motion, along: bool | None, law: str, othe
     swapped = list(_swapped(config, law, other, ratio))
     stood = abs(ratio) < STOOD and not swapped
     if stood:
-        yield Finding(
-            "two encoders",
-            PROBLEM,
-            f"[{other}] stood still while [{law}] moved",
-            f"cable or object of [{other}]",
-            numbers,
-        )
+        text = f"[{other}] stood still while [{law}] moved"
+        yield Finding("two encoders", PROBLEM, text, f"cable or object of [{other}]", numbers)
     elif ratio < 0.0:
         text = f"[{law}] and [{other}] count against each other"
         wrong, right = (other, law) if along else (law, other)
