@@ -129,7 +129,7 @@ class Display(Protocol):
 
 
 class OnlyShows:
-    """What a display leaves out of `Display` when it is not told, takes no orders, and opens nothing."""
+    """What a display leaves out of `Display` when it shows nothing, takes no orders, and opens nothing."""
 
     def note(self, text: str) -> None:
         """See `Display`."""
