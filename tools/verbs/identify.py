@@ -253,7 +253,7 @@ def identify(
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
     from jointctl.tools.recording.report_page import check_target
-    from jointctl.tools.written_file import replace_file, require_target
+    from jointctl.tools.written_file import refuse_unwritable, replace_file, require_target
 
     options = options or Options()
     if out is not None and out.suffix != ".toml":
@@ -263,6 +263,8 @@ def identify(
     if into is not None and not into.exists() and shipped_config(into.name).exists():
         hint = f"`jointctl new FILE --from {into.stem}` makes one of your own"
         raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
+    if into is not None:
+        refuse_unwritable(into)
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
     in_time = is_series(data_path, given)

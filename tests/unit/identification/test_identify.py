@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -157,6 +158,15 @@ def test_windows_line_ends_stay():
 
 def test_the_snippet_is_what_the_configuration_reads():
     assert tomlkit.parse(friction_snippet(VALUES, [])).unwrap() == {"friction": VALUES}
+
+
+def test_a_protected_configuration_is_refused_before_the_fit(sweep, config, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != config)
+    monkeypatch.setattr("jointctl.tools.verbs.identify._from_plateaus", None)  # the fit
+    before = contents(config.parent)
+    with pytest.raises(DataError, match="cannot be written: no permission"):
+        identify(sweep, output(), into=config, options=QUICK)
+    assert contents(config.parent) == before
 
 
 def test_a_configuration_without_friction_gets_it(sweep, config):
