@@ -42,6 +42,11 @@ class DriveIdentity:
     serial: str
     name: str = ""
 
+    @property
+    def text(self) -> str:
+        """By which one drive is told from another: vendor, product and serial number."""
+        return f"{self.vendor} {self.product} serial {self.serial}"
+
 
 @dataclass(frozen=True)
 class CommissioningReport:

@@ -45,6 +45,13 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     time_s = read_run_log(log).records.time_ns * 1e-9
     assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
     assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])
+    sidecar = out.with_suffix(".json")
+    about = sidecar.read_text()
+    sidecar.write_text(about.replace('"serial": "1"', '"serial": "2"'))
+    assert sidecar.read_text() != about
+    joint.run(*SWEEP, "-y", "--resume").refused(6, "another drive answers than before", "serial 1; it was", "serial 2")
+    assert out.read_text() == kept
+    sidecar.write_text(about)
     done = joint.run(*SWEEP, "-y", "--resume")
     assert done.code == 0, done.err
     assert joint.disabled()

@@ -48,7 +48,7 @@ class StopSignals:
         self._again = False  # the next signal is no new one
         self.looked_ns: int | None = None  # by `now_ns`; from the user's yes on, which may be for several motions
         self.stood_s = 0.0  # since then, if it was long
-        self.drives: list[str] = []  # those that answered first, by vendor, product and serial number
+        self.drives: list[str] = []  # those that answered first, `DriveIdentity.text` of each
         self._command = threading.Lock()
 
     @property
@@ -115,7 +115,7 @@ class StopSignals:
 
     def require_same(self, drives: Sequence[DriveIdentity]) -> None:
         """`DeviceError` where another drive answers than at a motion before: one yes is for one joint."""
-        found = [f"{drive.vendor} {drive.product} serial {drive.serial}" for drive in drives]
+        found = [drive.text for drive in drives]
         if self.drives and found != self.drives:
             before = ", ".join(self.drives)
             raise DeviceError(

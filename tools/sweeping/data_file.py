@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table as TerminalTable
 
+from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
 from jointctl.tools.drawing import BLUE, ORANGE, RED
@@ -83,6 +84,14 @@ class SweepFile:
     def elapsed_s(self) -> float:
         """Time column of the last row before this session, so that time goes on."""
         return float(self._sidecar["elapsed_s"])
+
+    @property
+    def drives(self) -> list[str]:
+        """On which drive it was measured, as `StopSignals.drives`; none where the sidecar does not say."""
+        drive = self._sidecar.get("drive")
+        if not isinstance(drive, dict):
+            return []
+        return [DriveIdentity(*(str(drive.get(key, "")) for key in ("vendor", "product", "revision", "serial"))).text]
 
     @classmethod
     def create(

@@ -111,6 +111,8 @@ class Sweep:
         try:
             if options.resume:
                 self.file = SweepFile.resume(self.out, torque_constant_NmpA(self.config), self.plan.hash)
+                if self.control is not None:
+                    self.control.signals.drives = self.file.drives  # data of two drives would be one curve
                 done = self.file.done
                 todo = [p for p in todo if p.index not in done]
                 self._unsettled = {p.index: p for p in self.plan.points if p.index in self.file.unsettled}
