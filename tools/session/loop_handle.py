@@ -42,6 +42,7 @@ class LoopHandle(contextlib.AbstractContextManager["LoopHandle"]):
     process has gone when it ends.  `marker_fds` show whose loop it is (`drivers.bus_lock`).
     """
 
+    _processor: int | None = None  # that the loop has for itself from `go` on
     _allowed: Mapping[int, set[int]] = {}  # where the threads of this process could run before
     _cycle_ns = _looked_ns = _stood_ns = 0  # of `_hung_ns`
 
@@ -54,7 +55,7 @@ class LoopHandle(contextlib.AbstractContextManager["LoopHandle"]):
         self._tail = 0
         self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
-        self._processor = config.loop.cpu  # that the loop has for itself from `go` on
+        self._processor = config.loop.cpu
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         theirs, ours = os.pipe()
         self._alive = keep_from_forks(os.fdopen(ours, "wb"))  # closed with this process, and by exec
