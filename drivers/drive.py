@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from jointctl.drivers.errors import DeviceError, JointctlError
+from jointctl.drivers.errors import DeviceError, blamed
 from jointctl.firmware_py.kernel import kernel
 
 T = TypeVar("T")
@@ -199,40 +198,31 @@ class DriveGroup:
     def __init__(self, drives: Sequence[Drive], buses: Sequence[int] = (), names: Sequence[str] = ()) -> None:
         """`buses`: of each drive the number of the first one on the same bus; none: all are on one.
 
-        `names`: of each drive what stands before its errors, as the file of its joint.
+        `names`: of each drive what stands before its errors, see `blamed`, as the file of its joint.
         """
         self.drives, self._buses = tuple(drives), buses
-        self._names = names or [""] * len(drives)
-        self._parts = [d for d in drives if isinstance(d, DriveOfArm)] if len(drives) > 1 else []
+        self._named = list(zip(drives, names or [""] * len(drives), strict=True))
+        self._parts = [(d, name) for d, name in self._named if isinstance(d, DriveOfArm)] if len(drives) > 1 else []
 
     def commission(self, approve: Approval | None = None) -> list[CommissioningReport]:
         """`Drive.commission` of each; all are left disabled."""
-        for part in self._parts:
-            with self._named(part):
+        for part, name in self._parts:
+            with blamed(name):
                 part.take_over(approve)
         reports = []
-        for drive in self.drives:
-            with self._named(drive):
+        for drive, name in self._named:
+            with blamed(name):
                 reports.append(drive.commission(approve))
         return reports
 
     def start_cyclic(self) -> None:
         """`Drive.start_cyclic` of each."""
-        for part in self._parts:
-            with self._named(part):
+        for part, name in self._parts:
+            with blamed(name):
                 part.verify()
-        for drive in self.drives:
-            with self._named(drive):
+        for drive, name in self._named:
+            with blamed(name):
                 drive.start_cyclic()
-
-    @contextmanager
-    def _named(self, drive: object) -> Iterator[None]:
-        try:
-            yield
-        except JointctlError as error:
-            name = self._names[self.drives.index(drive)]
-            error.message = f"{name}: {error.message}" if name else error.message
-            raise
 
     def port(self) -> Any:
         """The record arrays of all as one."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 import errno
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 # --- Text of others (names of files, values, what a library says) as it may be shown: one line, no control ---
@@ -169,3 +171,15 @@ class MarginError(JointctlError):
     """The control loop would have too little stability margin with the measured delay: refused before enabling."""
 
     exit_code = 9
+
+
+@contextmanager
+def blamed(name: str) -> Iterator[None]:
+    """An error, with the name of the joint in front where it is one of several."""
+    try:
+        yield
+    except BusError:  # it names the node, which need not be the joint's that has come across it
+        raise
+    except JointctlError as error:
+        error.message = f"{name}: {error.message}" if name else error.message
+        raise

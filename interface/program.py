@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError, one_line
+from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError, blamed, one_line
 from jointctl.drivers.stop_note import now_ns
 from jointctl.firmware_py.motion_records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
@@ -250,7 +250,6 @@ class Program:
 
     def _moves(self, starts_rad: Sequence[float], targets_rad: Sequence[float], duration_s: float) -> list[NewMotion]:
         from jointctl.tools.session.live_changes import new_motion
-        from jointctl.tools.session.plan import blamed
 
         motions = []
         for number, (name, config) in enumerate(zip(self._axes.names, self._axes.joints, strict=True)):
@@ -267,7 +266,6 @@ class Program:
         from jointctl.firmware_py.kernel import plain
         from jointctl.firmware_py.live_change import move_duration_s
         from jointctl.tools.session.live_changes import checked_motion
-        from jointctl.tools.session.plan import blamed
 
         tables = spline_tables(times_s, positions_rad, len(self._axes.names))
         motions = []

@@ -52,6 +52,8 @@ class Mode(IntEnum):
     CYCLIC_SYNC_TORQUE = 10
 
 
+MODE_SHOWN = "modes of operation display"  # 6061, in messages
+
 # bit of object 6502h (supported drive modes) for each mode
 SUPPORTED_MODE_BIT = {
     Mode.PROFILE_POSITION: 0,

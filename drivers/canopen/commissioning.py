@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from jointctl.drivers.canopen.cia import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
+from jointctl.drivers.canopen.cia import MODE_SHOWN, SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
 from jointctl.drivers.canopen.eds import EdsFile
 from jointctl.drivers.canopen.encoder import EncoderFindings, commission_drive_object
 from jointctl.drivers.canopen.pdo import (
@@ -202,7 +202,7 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
     findings.mode = usable[0]
     objects.write(0x6060, 0, findings.mode, what="modes of operation")
     for _ in range(ATTEMPTS):
-        shown = objects.read(0x6061, what="modes of operation display")
+        shown = objects.read(0x6061, what=MODE_SHOWN)
         if shown == findings.mode:
             break
         pause(PAUSE_S)

@@ -14,7 +14,7 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
-from jointctl.drivers.canopen.cia import Mode, NmtCommand
+from jointctl.drivers.canopen.cia import MODE_SHOWN, Mode, NmtCommand
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder import EncoderEnd
@@ -305,7 +305,7 @@ class CanopenDrive:
                 self._network.disconnect()
 
     def _require_mode(self, mode: int) -> None:
-        shown = self._objects.read(0x6061, what="modes of operation display")
+        shown = self._objects.read(0x6061, what=MODE_SHOWN)
         if shown != mode:
             raise DeviceError(f"node {self._settings.node}: 6061 shows mode {shown}, it was {mode:d}")
 

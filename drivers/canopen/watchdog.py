@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import can
 import canopen
 
-from jointctl.drivers.canopen.cia import EMERGENCY_ID, HEARTBEAT_ID, NmtState
+from jointctl.drivers.canopen.cia import EMERGENCY_ID, HEARTBEAT_ID, MODE_SHOWN, NmtState
 from jointctl.drivers.canopen.pdo import (
     COMMUNICATION_RPDO,
     DISABLED,
@@ -48,7 +48,6 @@ POLLS_PER_TIMEOUT = 20
 LONGEST_TIMEOUTS = 4
 PERIOD_S = 1.0
 MISSED = 3  # reads in a row without an answer, until it is an error before enabling and a warning afterwards
-MODE_SHOWN = "modes of operation display"
 _HINT = "find out which; the run is over"
 _ALONE = "RPDOs that get lost while our heartbeat does not stop the joint only when the loop withholds its heartbeat"
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
-from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError, MotionFault, UsageError, text_Nm
+from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, blamed, text_Nm
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.safety import ROUNDING_rad
@@ -169,18 +168,6 @@ class ArmPlan:
 
     config: ArmConfig
     joints: tuple[JointOfArmPlan, ...]
-
-
-@contextmanager
-def blamed(name: str) -> Iterator[None]:
-    """An error, with the name of the joint in front where it is one of several."""
-    try:
-        yield
-    except BusError:  # it names the node, which need not be the joint's that has come across it
-        raise
-    except JointctlError as error:
-        error.message = f"{name}: {error.message}" if name else error.message
-        raise
 
 
 def joint_lines(report: CommissioningReport, limits: Limits) -> list[str]:

@@ -23,6 +23,7 @@ from jointctl.drivers.errors import (
     JointctlError,
     MotionFault,
     NoDeviceError,
+    blamed,
     refused_by_system,
 )
 from jointctl.firmware_py.cycle import Histogram
@@ -38,7 +39,7 @@ from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, Vi
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
-from jointctl.tools.session.plan import Consent, Placed, RunPlan, blamed, prepare_log, require_ready
+from jointctl.tools.session.plan import Consent, Placed, RunPlan, prepare_log, require_ready
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import (
     Around,

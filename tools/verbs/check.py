@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import UsageError, text_Nm
+from jointctl.drivers.errors import UsageError, blamed, text_Nm
 from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -166,7 +166,7 @@ def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, a
     from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import require_loop
     from jointctl.tools.session.canopen_drive import require_buses
-    from jointctl.tools.session.plan import blamed, resolve_arm
+    from jointctl.tools.session.plan import resolve_arm
 
     require_buses(arm.joints)
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)

@@ -22,6 +22,7 @@ from jointctl.drivers.errors import (
     MarginError,
     MotionFault,
     UsageError,
+    blamed,
 )
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.analysis.arm_check import moments_s
@@ -33,7 +34,7 @@ from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_buses
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
-from jointctl.tools.session.plan import blamed, free, resolve, resolve_arm
+from jointctl.tools.session.plan import free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.check import check_arm
 from jointctl.tools.verbs.verb_options import arm_on_bus
