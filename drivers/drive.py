@@ -43,7 +43,7 @@ class DriveIdentity:
 
     @property
     def text(self) -> str:
-        """By which one drive is told from another: vendor, product and serial number."""
+        """What distinguishes one drive from another: vendor, product and serial number."""
         return f"{self.vendor} {self.product} serial {self.serial}"
 
 

@@ -80,7 +80,7 @@ MOVES_AGAIN = 3.0  # times `standstill_radps`: a joint that has stood does so no
 def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> int:
     """Position of this cycle; periods since the last sample, 0 if there is no new one.
 
-    Between samples the joint is assumed to move on, and soon as it is told.
+    Between samples the joint is assumed to move on: at its own velocity, and soon at that of the reference.
     """
     if sample.count == state.sample_count:
         state.sample_age_cycles += elapsed_cycles

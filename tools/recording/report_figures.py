@@ -356,7 +356,7 @@ def at_times(records: np.ndarray, chosen: np.ndarray, name: str, time_s: np.ndar
 
 
 def _drawn(i: int) -> dict[str, Any]:
-    """How the line of run i is told from the others."""
+    """How the line of run i differs from the others."""
     colours = (*SERIES, *EITHER_WAY)
     return {"color": colours[i % len(colours)], "linestyle": "-" if i < len(colours) else "--"}
 

@@ -3,9 +3,9 @@
 The motion is a multisine in torque on a slow triangle, whose legs differ in speed.  The joint slides all the time,
 because friction that holds takes every resonance away.  The law that keeps it on the triangle is weak; the multisine is
 the acceleration of the reference times the inertia that is believed, so that every limit and watchdog of a run is in
-force, and a swing of the feedback is told from the excitation.  Position and velocity of the reference are those of the
-triangle alone.  Each leg holds one period of the multisine at constant speed.  Legs of other speeds have their ripple
-at other frequencies, so that a median over the legs is free of it.
+force, and a swing of the feedback is not taken for the excitation.  Position and velocity of the reference are those of
+the triangle alone.  Each leg holds one period of the multisine at constant speed.  Legs of other speeds have their
+ripple at other frequencies, so that a median over the legs is free of it.
 
 Of each leg's period, without its trend and under a Hann window, the Fourier sums at the lines of the multisine:
 

@@ -382,7 +382,7 @@ class Gravity:
 def gravity_of(plan: ResponsePlan, records: Any, period_s: float, zero_rad: float) -> Gravity:
     """Of the legs of a frequency response, whose multisine has no mean over its period.
 
-    Over the way of a joint the cosine is hardly told from the friction's asymmetry: where it is not sure, the angle
+    Over the way of a joint the cosine hardly differs from the friction's asymmetry: where it is not sure, the angle
     without lever is the configured `zero_rad`.
     """
     cycle = np.round(np.asarray(records.trajectory_s) / period_s).astype(int)

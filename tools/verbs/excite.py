@@ -51,7 +51,7 @@ def excite(
     dry_run: DryRun = False,
     allow_low_margin: AllowLowMargin = False,
 ) -> int:
-    """Move so that inertia, gravity, friction and its load can be told apart; writes a run log for `identify`."""
+    """Move so that inertia, gravity, friction and its load can be separated; writes a run log for `identify`."""
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.sweeping.carry_out import config_of_sweep

@@ -343,7 +343,7 @@ class Tune:
 
     def _take_gravity(self, kept: dict[str, Any]) -> None:
         self.carrier.output.note(
-            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else "  none that can be told"
+            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else "  none that is certain"
         )
         if kept["found"]:
             self.config = with_values(self.config, self.gravity_values())
