@@ -78,7 +78,7 @@ def test_a_stop_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, r
     by_signal, by_page = (StopRequest.NONE, request_) if by == "a viewer" else (request_, StopRequest.NONE)
     broken = OSError("no page") if "broken" in by else None
     session = Session.__new__(Session)
-    session._config = virtual_config
+    session.plan = Mock(configs=(virtual_config,))
     loop: Any = _BrakingLoop()
     watch = RunWatch.__new__(RunWatch)
     watch.around = Mock(signals=Mock(request=by_signal))
@@ -86,6 +86,21 @@ def test_a_stop_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, r
     session._brake(loop, watch)
     assert loop.polls == 0, "it is braked to the end"
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_a_failed_supervisor_of_an_arm_waits_for_its_slowest_joint(virtual_config: Any, slow: bool) -> None:
+    """Not for the first one's time: that took the others out of their ramps.  The twin has no slow one."""
+    at_once = dict.fromkeys(("stop_timeout_s", "release_s", "off_timeout_s"), 0.0)
+    quick = virtual_config.model_copy(update={"sequence": virtual_config.sequence.model_copy(update=at_once)})
+    session = Session.__new__(Session)
+    session.plan = Mock(configs=(quick, virtual_config if slow else quick))
+    loop: Any = _BrakingLoop()
+    watch = RunWatch.__new__(RunWatch)
+    watch.around = Mock(signals=Mock(request=StopRequest.NONE))
+    watch.display = Mock(stop_request=Mock(return_value=StopRequest.NONE))
+    session._brake(loop, watch)
+    assert (loop.polls == 0) is slow
 
 
 # --- the loop stood still (SIGSTOP, a suspended machine) and goes on ---

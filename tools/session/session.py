@@ -364,11 +364,12 @@ class Session:
     def _brake(self, loop: LoopHandle, watch: RunWatch, how: StopRequest = StopRequest.RAMP) -> None:
         """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
 
-        The user may still ask for more than a ramp, at the page, by Foxglove and ROS 2 as well.
+        The user may still ask for more than a ramp, at the page, by Foxglove and ROS 2 as well.  The joints of an arm
+        wait for the slowest one.
         """
-        sequence = self._config.sequence
+        times_s = [(s.stop_timeout_s, s.release_s, s.off_timeout_s) for s in (c.sequence for c in self.plan.configs)]
         loop.request_stop(how)
-        give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
+        give_up_s = time.monotonic() + sum(map(max, zip(*times_s, strict=True)))
         with contextlib.suppress(MotionFault):
             while loop.running() and time.monotonic() < give_up_s:
                 loop.request_stop(watch.around.signals.request)
