@@ -32,10 +32,8 @@ class HarmonicSeries:
 
 @record
 class FrictionBranch:
-    """One direction of the multi-stage model (11), mirrored to positive speed and friction.
-
-    Speeds are those of the joint [rad/s], torques those at the motor [Nm].
-    """
+    """One direction of the multi-stage model (11), mirrored to positive speed and friction: speeds of the joint
+    [rad/s], torques at the motor [Nm]."""
 
     coulomb_Nm: f8
     static_Nm: f8
@@ -526,6 +524,8 @@ class AxisState:
     sample_count: i8
     gap_cycles: i8  # periods since the sample before this cycle's, 0 where there is no new one
     sample_age_cycles: i8
+    missing_samples: i8  # in this phase, less those that came
+    missed_slots: i8  # in this phase, less those that were in time
     saturated_cycles: i8
     still_cycles: i8
     frozen_samples: i8  # in a row, without a gap, that did not change

@@ -79,6 +79,8 @@ def enter(state: AxisState, phase: int) -> None:
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
+    state.missing_samples = 0
+    state.missed_slots = 0
     state.ready = 0
 
 
@@ -200,8 +202,9 @@ def check_supervision(
     _check_drive(state, sample)
     limits, sequence = constants.limits, constants.sequence
     if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
-        if state.sample_age_cycles > limits.sample_age_max_cycles:
-            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
+        missing = max(state.sample_age_cycles, state.missing_samples)  # of most: a delay that no margin allows for
+        if missing > limits.sample_age_max_cycles:
+            trip(state, Fault.STALE_SAMPLE, float(missing), sample.drive_error)
         if sample.bus_errors > limits.sample_age_max_cycles:
             trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
         if 0 < sequence.supervisor_max_cycles < supervisor_age_cycles:
@@ -216,8 +219,9 @@ def check_supervision(
     if state.phase == AxisPhase.WAITING and sequence.supervisor_max_cycles > 0:
         if supervisor_age_cycles > sequence.wait_max_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
-    if powered(state.phase) and skipped_cycles > limits.skipped_max_cycles:
-        trip(state, Fault.OVERRUN, float(skipped_cycles), 0)
+    state.missed_slots = max(state.missed_slots - 1, 0) + skipped_cycles
+    if powered(state.phase) and state.missed_slots > limits.skipped_max_cycles:
+        trip(state, Fault.OVERRUN, float(state.missed_slots), 0)
 
 
 @kernel
@@ -267,14 +271,9 @@ def check_reference(constants: AxisConstants, state: AxisState) -> None:
     """The desired motion, before it is followed."""
     reference = state.reference
     fault = reference_fault(
-        constants.limits,
-        reference.position_rad,
-        reference.velocity_radps,
-        reference.acceleration_radps2,
-        reference.jerk_radps3,
-        constants.sequence.brake_radps2,
-        REACTION_CYCLES * constants.law.period_s,
-    )
+        constants.limits, reference.position_rad, reference.velocity_radps, reference.acceleration_radps2,
+        reference.jerk_radps3, constants.sequence.brake_radps2, REACTION_CYCLES * constants.law.period_s,
+    )  # fmt: skip
     trip(state, fault, state.reference.position_rad, 0)
 
 

@@ -175,10 +175,12 @@ class Limits(Section):
     following_error_max_rad: Annotated[float, between(0.0, 10.0, open_low=True)]
     # between two samples a period apart; more is not believed
     position_jump_max_rad: Annotated[float, between(0.0, 10.0, open_low=True)]
-    sample_age_max_s: Annotated[float, between(0.0, 1.0, open_low=True)]  # without a new position for longer: fault
+    # without a new position for longer, or so much longer than with one: fault
+    sample_age_max_s: Annotated[float, between(0.0, 1.0, open_low=True)]
     # at the torque limit for longer means blocked
     saturation_max_s: Annotated[float, between(0.0, 60.0, open_low=True)]
-    skipped_max_s: Annotated[float, between(0.0, 1.0, open_low=True)]  # periods lost in one overrun: more is a fault
+    # periods lost in one overrun, or so many more lost than kept: more is a fault
+    skipped_max_s: Annotated[float, between(0.0, 1.0, open_low=True)]
     standstill_radps: Annotated[float, between(0.0, 10.0, open_low=True)]  # slower counts as standing
     # of the range from -torque_max_Nm to torque_max_Nm: a torque that reverses by more, four times in a row, is a fault
     swing_torque_share: Annotated[float, between(0.2, 1.0)] = 0.5

@@ -150,7 +150,7 @@ class GuardHandle:
 
 SERIAL_TEXTS: dict[Fault, FaultText] = {
     Fault.STALE_SAMPLE: FaultText(
-        "no usable position reply came for {value:.0f} cycles",
+        "no usable position reply came for {value:.0f} cycles, at once or again and again",
         # Linux hands over what a serial port received by a worker of ordinary priority, however urgent the loop is
         "cable or drive went silent, noise garbles the replies, or a busy computer hands them over late",
         "check the cable and its ground, and what else the computer does; the drive's own limits watched the joint "

@@ -130,11 +130,11 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         follows_pause=True,
     ),
     Fault.STALE_SAMPLE: FaultWords(
-        "no position came for {value:.0f} cycles",
+        "no position came for {value:.0f} cycles, at once or again and again",
         "frames lost, cable, bus load, or the drive went silent",
         "check wiring and termination; watch the bus with candump",
         two_encoders=FaultText(
-            "no position of both encoders came for {value:.0f} cycles",
+            "no position of both encoders came for {value:.0f} cycles, at once or again and again",
             "frames lost, cable, bus load, or the drive or the joint's encoder went silent",
             "check wiring and termination; watch the bus with candump: which of the two is missing?",
         ),
@@ -228,7 +228,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "let it rest, or raise limits.standstill_radps",
     ),
     Fault.OVERRUN: FaultWords(
-        "the loop was held up for {value:.0f} cycles",
+        "the loop was held up for {value:.0f} cycles, at once or again and again",
         "the computer was busy: no real-time priority, power saving, a debugger",
         "run `jointctl doctor`; set loop.priority and loop.cpu",
     ),

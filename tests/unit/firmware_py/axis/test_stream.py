@@ -88,6 +88,7 @@ def test_without_set_points_it_brakes_and_rests_and_may_begin_again(overrun: int
     run = StreamRig()
     ramp(run, 301)
     last_rad = 0.2 * (0.3 - 0.05)
+    run.axis.limits.skipped_max_cycles = 1 << 40
     for _ in range(200 // overrun):
         run.tick(overrun)
     position_rad, velocity_radps = run.at
@@ -437,6 +438,7 @@ def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple
     limits = run.axis.limits
     limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 2.0
     limits.saturation_max_cycles = 1 << 40  # what is allowed to be asked for may take all torque
+    limits.skipped_max_cycles = 1 << 40
     for position, velocity, torque, at_ms in points:
         run.put(position, velocity, torque_Nm=torque, at_ms=at_ms)
         for _ in range(8):

@@ -48,6 +48,17 @@ def missing_samples(run: Any, count: int) -> None:
         run.tick(fresh=False)
 
 
+def every_nth_sample(run: Any, n: int) -> None:
+    """A delay of (n - 1) / 2 periods in the mean, which the check of the margins has not seen."""
+    for cycle in range(60):
+        run.tick(fresh=cycle % n == 0)
+
+
+def every_nth_slot(run: Any, n: int) -> None:
+    for _ in range(20):
+        run.tick(n)
+
+
 def shows(run: Any, drive_state: int) -> None:
     run.joint.drive_state = DriveState(drive_state)
     run.tick()
@@ -55,6 +66,8 @@ def shows(run: Any, drive_state: int) -> None:
 
 @pytest.mark.trips(Fault.STALE_SAMPLE, "(Fault.STALE_SAMPLE, missing_samples, 5, 6)")
 @pytest.mark.stays(Fault.STALE_SAMPLE, "(Fault.STALE_SAMPLE, missing_samples, 5")
+@pytest.mark.trips(Fault.STALE_SAMPLE, "(Fault.STALE_SAMPLE, every_nth_sample, 2, 3)")
+@pytest.mark.stays(Fault.STALE_SAMPLE, "(Fault.STALE_SAMPLE, every_nth_sample, 2")
 @pytest.mark.trips(Fault.BUS_ERROR, '(Fault.BUS_ERROR, reports("bus_errors"), 5, 6)')
 @pytest.mark.stays(Fault.BUS_ERROR, '(Fault.BUS_ERROR, reports("bus_errors"), 5')
 @pytest.mark.trips(Fault.DRIVE_SILENT, "(Fault.DRIVE_SILENT, late_heartbeat, 600, 601)")
@@ -65,16 +78,20 @@ def shows(run: Any, drive_state: int) -> None:
 @pytest.mark.stays(Fault.CLIENT_SILENT, "(Fault.CLIENT_SILENT, late_client, 100")
 @pytest.mark.trips(Fault.OVERRUN, "(Fault.OVERRUN, lambda run, skipped: run.tick(skipped + 1), 8, 9)")
 @pytest.mark.stays(Fault.OVERRUN, "(Fault.OVERRUN, lambda run, skipped: run.tick(skipped + 1), 8")
+@pytest.mark.trips(Fault.OVERRUN, "(Fault.OVERRUN, every_nth_slot, 2, 3)")
+@pytest.mark.stays(Fault.OVERRUN, "(Fault.OVERRUN, every_nth_slot, 2")
 @pytest.mark.trips(Fault.DRIVE_FAULT, "(Fault.DRIVE_FAULT, shows, DriveState.ENABLED, DriveState.FAULT)")
 @pytest.mark.parametrize(
     ("fault", "disturb", "inside", "beyond"),
     [
         (Fault.STALE_SAMPLE, missing_samples, 5, 6),
+        (Fault.STALE_SAMPLE, every_nth_sample, 2, 3),
         (Fault.BUS_ERROR, reports("bus_errors"), 5, 6),
         (Fault.DRIVE_SILENT, late_heartbeat, 600, 601),
         (Fault.SUPERVISOR_LOST, reports("supervisor_age_cycles"), 10, 11),
         (Fault.CLIENT_SILENT, late_client, 100, 101),
         (Fault.OVERRUN, lambda run, skipped: run.tick(skipped + 1), 8, 9),
+        (Fault.OVERRUN, every_nth_slot, 2, 3),
         (Fault.DRIVE_RESTARTED, reports("restarts"), 0, 1),
         (Fault.DRIVE_FAULT, shows, DriveState.ENABLED, DriveState.FAULT),
         (Fault.DRIVE_FAULT, shows, DriveState.ENABLED, DriveState.FAULT_BRAKING),
@@ -166,7 +183,7 @@ def test_a_stuck_reading_with_holes_is_noticed_all_the_same(rig: NewRig, every: 
     """Each hole began the watch anew: a stuck encoder behind a bus with losses was not seen.  The twin moves."""
     run = rig(0.0)
     run.axis.limits.frozen_max_rad = 0.01
-    run.axis.limits.saturation_max_cycles = 1 << 40
+    run.axis.limits.saturation_max_cycles = run.axis.limits.sample_age_max_cycles = 1 << 40
     run.until(AxisPhase.TRACKING).run(20)
     if stuck:
         run.joint.step = lambda *_: None
