@@ -158,8 +158,8 @@ class Carrier:
         if result is None:
             raise NotCarriedOut(session.drive_state)
         require_off(session.drive_state)
-        if result.stopped_by:
-            raise NotCarriedOut(session.drive_state, result.stopped_by)
+        if by := result.stopped_by or self.control.signals.name:  # a stop may have come after the result
+            raise NotCarriedOut(session.drive_state, by)
         if result.lost_records:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
         records = read_run_log(result.log_path).records

@@ -87,18 +87,14 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
     if not assume_yes:
         require_terminal()
     with in_control(config, output) as control:
-        try:
-            return _pull(config, output, control, assume_yes=assume_yes, torque_Nm=torque_Nm)
-        except KeyboardInterrupt:
-            output.note(f"interrupted{control.signals.by_command}; nothing moved")
-            return INTERRUPTED
+        return _pull(config, output, control, assume_yes=assume_yes, torque_Nm=torque_Nm)
 
 
 def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     from jointctl.firmware_py.states import Fault
     from jointctl.tools.inspection.motion_check import check_run, ended_finding, judged, make_plan, motion_findings
     from jointctl.tools.session.plan import TerminalConsent
-    from jointctl.tools.session.result import never_begun, require_off
+    from jointctl.tools.session.result import broken_off, never_begun, require_off
     from jointctl.tools.session.session import Session
     from jointctl.tools.tuning.frequency_response import motor_fed
 
@@ -108,8 +104,7 @@ def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool,
     try:
         result = session.run()
     except KeyboardInterrupt:
-        require_off(session.drive_state)
-        raise
+        return broken_off(session.drive_state, output, control.signals.by_command)
     except MarginError as error:  # gains of the file are none of the check
         softer = (
             f"the check pulls with a law of its own: its spring is softer with less --torque (now {plan.torque_Nm:g})"

@@ -95,4 +95,6 @@ def tune(
 
 def _kept(job: Tune) -> str:
     """After an interruption."""
+    if job.written:
+        return f"{job.original.path} has what was found, {job.folder / 'before.toml'} how it was"
     return f"{job.original.path} is as it was; {'--resume goes on' if job.state else 'no step was done'}"

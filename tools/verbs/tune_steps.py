@@ -128,6 +128,7 @@ class Tune:
     found_friction: Identification | None = field(init=False, default=None)
     found_map: FoundMap | None = field(init=False, default=None)
     gains: ChosenGains | None = field(init=False, default=None)
+    _about: dict[str, Any] = field(init=False, default_factory=dict)  # what the steps are of
 
     def __post_init__(self) -> None:
         require_encoders(self.original, self.options.law)
@@ -211,7 +212,13 @@ class Tune:
             self.state = {name: kept[name] for name in steps if name in kept}
         elif not self.carrier.consent.dry_run:
             path.unlink(missing_ok=True)  # a later --resume must not go on with an older tune's steps
-        self._about: dict[str, Any] = {"about": about, "asked": asked}
+        self._about = {"about": about, "asked": asked}
+
+    @property
+    def written(self) -> bool:
+        """Whether the file has what was found."""
+        path = self.original.path
+        return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == self._about.get("written")
 
     def _save(self) -> None:
         kept = {**self._about, "drives": self.carrier.drives, **self.state}
@@ -582,9 +589,9 @@ class Tune:
             kept = self.folder / "tuned.toml"
             replace_file(kept, content)
             raise DataError(f"{path}: was changed during the tune, and is left as it is", f"{kept} has what was found")
-        replace_file(path, content, load_config)
         replace_file(self.folder / "before.toml", text.encode())
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
+        replace_file(path, content, load_config)
         write_report(self, [[".".join(one.section), one.key, one.value] for one in values])
         self.carrier.output.note(f"written: {path}; as it was: {self.folder / 'before.toml'}")

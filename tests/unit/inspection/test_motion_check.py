@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -274,6 +275,32 @@ def test_an_interruption_does_not_hide_the_fault(
     assert code == (130 if fault is Fault.NONE else 1)
     assert "stopped by SIGINT" in told.err
     assert ("VELOCITY_LIMIT" in told.out) is (fault is not Fault.NONE)
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_an_interruption_behind_the_motion_does_not_say_that_nothing_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], moved: bool
+) -> None:
+    """As it is judged, say; the twin comes before the motion."""
+    config = config_with(tmp_path, log__folder=str(tmp_path))
+
+    def run() -> SimpleNamespace:
+        if not moved:
+            raise KeyboardInterrupt
+        return SimpleNamespace(
+            stopped_by="", drive_state="switch on disabled", records=(), fault=Fault.NONE, fault_text=None,
+            report=SimpleNamespace(counts_per_motor_turn=0.0),
+        )  # fmt: skip
+
+    def judge(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    session = SimpleNamespace(run=run, drive_state="switch on disabled")
+    monkeypatch.setattr("jointctl.tools.session.session.Session", lambda *_: session)
+    monkeypatch.setattr("jointctl.tools.inspection.motion_check.motion_findings", judge)
+    with pytest.raises(KeyboardInterrupt) if moved else nullcontext():
+        assert doctor_motion_module.doctor_motion(config, Output(), assume_yes=True) == 130
+    assert ("nothing moved" in capsys.readouterr().err) is not moved
 
 
 class Refusing:
