@@ -335,10 +335,8 @@ class SetPoint:
 
 @record
 class StreamConstants:
-    """Limits of set-points, and the ring that they come through: `written` is counted up behind each of them.
-
-    The limits never change after the start; ring, `written` and `alive_ns` belong to the program outside.
-    """
+    """Limits of set-points, and the ring that they come through: `written` is counted up behind each of them; the
+    limits never change after the start; ring, `written` and `alive_ns` belong to the program outside."""
 
     delay_ns: i8
     timeout_ns: i8  # between two set-points
@@ -526,6 +524,7 @@ class AxisState:
     sample_age_cycles: i8
     missing_samples: i8  # in this phase, less those that came
     missed_slots: i8  # in this phase, less those that were in time
+    unsent_cycles: i8  # in this phase, less those whose command was sent
     saturated_cycles: i8
     still_cycles: i8
     frozen_samples: i8  # in a row, without a gap, that did not change

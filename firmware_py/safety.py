@@ -79,8 +79,7 @@ def enter(state: AxisState, phase: int) -> None:
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
-    state.missing_samples = 0
-    state.missed_slots = 0
+    state.missing_samples, state.missed_slots, state.unsent_cycles = 0, 0, 0
     state.ready = 0
 
 
@@ -205,8 +204,10 @@ def check_supervision(
         missing = max(state.sample_age_cycles, state.missing_samples)  # of most: a delay that no margin allows for
         if missing > limits.sample_age_max_cycles:
             trip(state, Fault.STALE_SAMPLE, float(missing), sample.drive_error)
-        if sample.bus_errors > limits.sample_age_max_cycles:
-            trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
+        state.unsent_cycles = max(state.unsent_cycles + (1 if sample.bus_errors > 0 else -1), 0)
+        unsent = max(sample.bus_errors, state.unsent_cycles)
+        if unsent > limits.sample_age_max_cycles:
+            trip(state, Fault.BUS_ERROR, float(unsent), 0)
         if 0 < sequence.supervisor_max_cycles < supervisor_age_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
         client_s = client_silent_s(constants.stream, state.slot_ns)

@@ -45,8 +45,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.stood_rad = 0.0
     state.sample_count = 0
     state.sample_age_cycles = 0
-    state.missing_samples = 0
-    state.missed_slots = 0
+    state.missing_samples, state.missed_slots, state.unsent_cycles = 0, 0, 0
     state.gap_cycles = 0
     state.saturated_cycles = 0
     state.still_cycles = 0

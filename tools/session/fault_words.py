@@ -192,7 +192,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "look for what blocked it: disk, memory, a debugger",
     ),
     Fault.BUS_ERROR: FaultWords(
-        "{value:.0f} frames in a row could not be sent",
+        "{value:.0f} frames could not be sent, at once or again and again",
         "interface down, bus off, or nobody acknowledges: cable or bit rate",
         "ip -details link show, then bring the interface up again",
     ),

@@ -54,6 +54,13 @@ def every_nth_sample(run: Any, n: int) -> None:
         run.tick(fresh=cycle % n == 0)
 
 
+def every_nth_command(run: Any, n: int) -> None:
+    """The others are not sent, although SYNC is: the drive holds a torque for n periods."""
+    for cycle in range(60):
+        run.sample.bus_errors = cycle % n
+        run.tick()
+
+
 def every_nth_slot(run: Any, n: int) -> None:
     for _ in range(20):
         run.tick(n)
@@ -70,6 +77,8 @@ def shows(run: Any, drive_state: int) -> None:
 @pytest.mark.stays(Fault.STALE_SAMPLE, "(Fault.STALE_SAMPLE, every_nth_sample, 2")
 @pytest.mark.trips(Fault.BUS_ERROR, '(Fault.BUS_ERROR, reports("bus_errors"), 5, 6)')
 @pytest.mark.stays(Fault.BUS_ERROR, '(Fault.BUS_ERROR, reports("bus_errors"), 5')
+@pytest.mark.trips(Fault.BUS_ERROR, "(Fault.BUS_ERROR, every_nth_command, 2, 3)")
+@pytest.mark.stays(Fault.BUS_ERROR, "(Fault.BUS_ERROR, every_nth_command, 2")
 @pytest.mark.trips(Fault.DRIVE_SILENT, "(Fault.DRIVE_SILENT, late_heartbeat, 600, 601)")
 @pytest.mark.stays(Fault.DRIVE_SILENT, "(Fault.DRIVE_SILENT, late_heartbeat, 600")
 @pytest.mark.trips(Fault.SUPERVISOR_LOST, '(Fault.SUPERVISOR_LOST, reports("supervisor_age_cycles"), 10, 11)')
@@ -87,6 +96,7 @@ def shows(run: Any, drive_state: int) -> None:
         (Fault.STALE_SAMPLE, missing_samples, 5, 6),
         (Fault.STALE_SAMPLE, every_nth_sample, 2, 3),
         (Fault.BUS_ERROR, reports("bus_errors"), 5, 6),
+        (Fault.BUS_ERROR, every_nth_command, 2, 3),
         (Fault.DRIVE_SILENT, late_heartbeat, 600, 601),
         (Fault.SUPERVISOR_LOST, reports("supervisor_age_cycles"), 10, 11),
         (Fault.CLIENT_SILENT, late_client, 100, 101),
