@@ -113,7 +113,7 @@ class SwitchOff:
 
     def _braked(self) -> State:
         """The state after the quick stop, or the one that is left when its time is over."""
-        for _ in range(round(QUICK_STOP_S / POLL_S)):
+        for _ in range(round(max(self._braking_s, QUICK_STOP_S) / POLL_S)):
             state = state_of(self._objects)
             if state is not State.QUICK_STOP_ACTIVE:
                 break
@@ -161,6 +161,7 @@ def stop_node(
     *,
     encoder_node: int | None = None,
     sdo_timeout_s: float | None = None,
+    braking_s: float | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> str:
     """Stop and disable the drive at `node`, another controller's as well; closes `bus`.  See `SwitchOff.make_safe`."""
@@ -169,7 +170,8 @@ def stop_node(
     try:
         remote = network.add_node(node, _standard_objects())
         remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
-        switch_off = SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep)
+        objects = ObjectAccess(remote, "CiA 402")
+        switch_off = SwitchOff(network, node, objects, encoder_node, sleep, braking_s or QUICK_STOP_S)
         return switch_off.make_safe(brake_first=True)
     finally:
         with contextlib.suppress(Exception):  # what went wrong on it has been reported

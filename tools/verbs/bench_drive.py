@@ -205,10 +205,10 @@ class ReadableKeys:
             raise ConfigurationError(f"{name} (={value}) must be {rule}", _HINT)
         return value
 
-    def seconds(self, key: str) -> float | None:
-        """A time-out of [drive]; none rather than one that cannot be right."""
-        value = self.section("drive").get(key)
-        good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0.01 <= value <= 10.0
+    def seconds(self, section: str, key: str, most: float = 10.0) -> float | None:
+        """A time-out; none rather than one that cannot be right."""
+        value = self.section(section).get(key)
+        good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0.01 <= value <= most
         return float(value) if good and value is not None else None
 
 

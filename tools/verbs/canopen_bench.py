@@ -37,6 +37,7 @@ class CanTarget:
     node: int
     encoder_node: int | None = None
     sdo_timeout_s: float | None = None
+    braking_s: float | None = None
 
     @property
     def place(self) -> tuple[str, str]:
@@ -46,7 +47,9 @@ class CanTarget:
         from jointctl.drivers.canopen.switch_off import stop_node
 
         bus = open_python_can(self.interface, self.channel, self.bitrate_bitps, exclusive=False)
-        return stop_node(bus, self.node, encoder_node=self.encoder_node, sdo_timeout_s=self.sdo_timeout_s)
+        return stop_node(
+            bus, self.node, encoder_node=self.encoder_node, sdo_timeout_s=self.sdo_timeout_s, braking_s=self.braking_s
+        )
 
 
 class CanopenBench(BenchDrive):
@@ -75,7 +78,8 @@ class CanopenBench(BenchDrive):
         encoder_node = encoder.get("node") if encoder.get("source") == "node" else None
         return CanTarget(
             interface, channel, bitrate, node,
-            encoder_node if _whole(encoder_node, 1, HIGHEST_NODE) else None, keys.seconds("sdo_timeout_s"),
+            encoder_node if _whole(encoder_node, 1, HIGHEST_NODE) else None, keys.seconds("drive", "sdo_timeout_s"),
+            keys.seconds("sequence", "stop_timeout_s", 60.0),
         )  # fmt: skip
 
     def info(self, asked: Asked, output: Output) -> int:

@@ -152,7 +152,7 @@ class ElmoBench(BenchDrive):
         port = keys.required("drive.port", [keys.given.port, drive.get("port")], is_text, "a text in quotes")
         rates = [drive.get("baud_rate_bitps")]
         rate = keys.required("drive.baud_rate_bitps", rates, BAUD_RATES_bitps.__contains__, BAUD_RATES_TEXT)
-        return PortTarget(port, rate, keys.seconds("reply_timeout_s") or REPLY_TIMEOUT_S)
+        return PortTarget(port, rate, keys.seconds("drive", "reply_timeout_s") or REPLY_TIMEOUT_S)
 
     def info(self, asked: Asked, output: Output) -> int:
         """See `BenchDrive`: every answer as it came, and what it means at the joint."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,19 @@ def test_what_is_wrong_elsewhere_does_not_matter(tmp_path: Path, changes: tuple[
             load_config(path)
     shipped = load_config(CONFIGS / "virtual.toml")
     assert stop_target(path, environ=NOTHING) == CanTarget(
-        shipped.bus.interface, shipped.bus.channel, None, canopen_section(shipped).node
-    )
+        shipped.bus.interface, shipped.bus.channel, None, canopen_section(shipped).node,
+        braking_s=shipped.sequence.stop_timeout_s,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "braking_s"), [("12.5", 12.5), ("60.0", 60.0), ("61.0", None), ('"3"', None)])
+def test_how_long_it_may_brake_is_that_of_the_file_if_it_can_be_right(
+    tmp_path: Path, text: str, braking_s: float | None
+) -> None:
+    path = edited_file(tmp_path, ("\nstop_timeout_s = 3.0", f"\nstop_timeout_s = {text}"))
+    target = stop_target(path, environ=NOTHING)
+    assert isinstance(target, CanTarget)
+    assert target.braking_s == braking_s
 
 
 @pytest.mark.parametrize("changes", [(), (("[control]", "[control]\nkp ="),), (("\n[limits]", "\n[limts]"),)])
@@ -82,11 +94,12 @@ def test_without_any_file_the_command_line_is_enough(tmp_path: Path) -> None:
 
 def test_flag_beats_environment_beats_file(tmp_path: Path) -> None:
     path = edited_file(tmp_path)
+    expected = partial(CanTarget, braking_s=load_config(path).sequence.stop_timeout_s)
     environ = {"CAN_INTERFACE": "slcan", "CAN_CHANNEL": "/dev/ttyACM0", "CAN_BITRATE": "250000"}
-    assert stop_target(path, environ=environ) == CanTarget("slcan", "/dev/ttyACM0", 250_000, 1)
-    assert stop_target(path, GivenPlace(channel="x", bitrate=125_000), environ) == CanTarget("slcan", "x", 125_000, 1)
+    assert stop_target(path, environ=environ) == expected("slcan", "/dev/ttyACM0", 250_000, 1)
+    assert stop_target(path, GivenPlace(channel="x", bitrate=125_000), environ) == expected("slcan", "x", 125_000, 1)
     file_rate = load_config(path).bus.bitrate_bitps
-    assert stop_target(path, environ={**environ, "CAN_BITRATE": "fast"}) == CanTarget(
+    assert stop_target(path, environ={**environ, "CAN_BITRATE": "fast"}) == expected(
         "slcan", "/dev/ttyACM0", file_rate, 1
     )
 

@@ -18,7 +18,7 @@ import pytest
 from jointctl.drivers import bus_lock
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia import NmtCommand, State
-from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
+from jointctl.drivers.canopen.switch_off import POLL_S, QUICK_STOP_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
 from jointctl.drivers.drive import (
     UNTOUCHED,
     CommissioningReport,
@@ -148,9 +148,9 @@ class DriveInMemory:
     def wait(self, seconds: float) -> None:
         self.log.append(seconds)
 
-    def made_safe(self, **how: bool) -> str:
+    def made_safe(self, braking_s: float = QUICK_STOP_S, **how: bool) -> str:
         bus: Any = self
-        return SwitchOff(bus, 1, bus, 7, self.wait).make_safe(**how)
+        return SwitchOff(bus, 1, bus, 7, self.wait, braking_s).make_safe(**how)
 
 
 @pytest.mark.parametrize(
@@ -230,6 +230,18 @@ def test_anothers_drive_brakes_before_it_leaves_operational(states: list[Any], l
     drive = DriveInMemory(*states)
     assert drive.made_safe(brake_first=True) == "switch on disabled"
     assert drive.log == [*log, *TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]
+
+
+@pytest.mark.parametrize("braking_s", [1.0, 3.0])
+def test_anothers_drive_that_brakes_for_long_keeps_its_power_until_it_stands(braking_s: float) -> None:
+    """`jointctl stop` took it after two seconds, whatever `sequence.stop_timeout_s` was: a load fell while it braked.
+
+    The twin gives it no more time.
+    """
+    drive = DriveInMemory(ON, *[BRAKING] * 149, OFF)  # 3 s
+    assert drive.made_safe(braking_s, brake_first=True) == "switch on disabled"
+    at_rest = 150 if braking_s == 3.0 else 100
+    assert drive.log[: drive.log.index(NO_VOLTAGE)].count(POLL_S) == at_rest
 
 
 @pytest.mark.parametrize("refused", [0x6071, 0x60FF])
