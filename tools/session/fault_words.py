@@ -356,6 +356,16 @@ def held_up_text(fault: Fault, value: float, text: FaultText, records: np.recarr
     )
 
 
+def read_off_text(fault: Fault, text: FaultText, state: str) -> FaultText:
+    """`text`, of a drive that reads `state` afterwards and is off: what the loop has not seen is no emergency then."""
+    if fault is not Fault.OFF_TIMEOUT:
+        return text
+    return FaultText(
+        f"{text.happened}; it reads {state} now", "its own watchdog has stopped it, or its reports were lost",
+        "look at what came before it, if anything did; else check the bus",
+    )  # fmt: skip
+
+
 # --- What the loop reports without ending the run, in words: torque noise, learning that was switched off ---
 
 

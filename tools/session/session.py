@@ -36,7 +36,7 @@ from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, Run
 from jointctl.tools.recording.run_summary import KeptRecords, histogram_times, summarise
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
-from jointctl.tools.session.fault_words import held_up_text
+from jointctl.tools.session.fault_words import held_up_text, read_off_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
 from jointctl.tools.session.plan import Consent, Placed, RunPlan, prepare_log, require_ready
@@ -145,7 +145,7 @@ class Session:
                     raise KeyboardInterrupt from None
                 raise
             finally:
-                self.drive_state = self._made_safe(drives)
+                self.drive_state, _ = self._made_safe(drives)
                 drives.close()
                 if guard is not None:
                     guard.release(self.drive_state)
@@ -180,9 +180,10 @@ class Session:
         """The drives of all joints, nothing sent to them yet."""
         return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked, self.own is not None)
 
-    def _made_safe(self, drives: DriveGroup) -> str:
+    def _made_safe(self, drives: DriveGroup) -> tuple[str, list[str]]:
+        """The state of all in words, and that of each."""
         states = drives.make_safe(asked=bool(self.signals.commanded_ns))
-        return common_state([joint.name for joint in self._joints], states)
+        return common_state([joint.name for joint in self._joints], states), states
 
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
@@ -288,7 +289,7 @@ class Session:
                         each.poll()
                 time.sleep(POLL_S)
         except MotionFault as error:
-            state = self._made_safe(drives)
+            state, _ = self._made_safe(drives)
             self._log_end(watches, error)
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
@@ -306,7 +307,7 @@ class Session:
         for each in watches:
             with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
-        state = self._made_safe(drives)
+        state, states = self._made_safe(drives)
         for each in watches:
             if each.around.recorder is not None:
                 each.around.recorder.end()
@@ -329,7 +330,8 @@ class Session:
             for axis, joint in enumerate(self._joints)
         ]
         results = [
-            self._result(each, report, state, load) for each, report, load in zip(watches, reports, loads, strict=True)
+            self._result(each, report, state, load, own)
+            for each, report, load, own in zip(watches, reports, loads, states, strict=True)
         ]
         return replace(results[0], others=tuple(results[1:]))
 
@@ -378,7 +380,10 @@ class Session:
                 loop.beat()
                 time.sleep(POLL_S)
 
-    def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, bus_load: float) -> RunResult:
+    def _result(
+        self, watch: RunWatch, report: CommissioningReport, drive_state: str, bus_load: float, own_state: str = ""
+    ) -> RunResult:
+        """`drive_state`: of all joints, `own_state`: of this one."""
         loop, config = watch.loop, watch.config
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
@@ -395,6 +400,7 @@ class Session:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
             text = self._kind.fault_text(config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
+            text = read_off_text(fault, text, own_state) if is_safe(own_state) else text
             text = watch.mode_explained(fault, text) if is_safe(drive_state) else text
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         summary = summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC)

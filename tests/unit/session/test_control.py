@@ -40,6 +40,7 @@ from jointctl.tools.session.control import (
     stop_within_s,
 )
 from jointctl.tools.session.fault_words import FaultText
+from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import NOTED_WITHIN_NS, Session, came_before
 from jointctl.tools.verbs.start import Interruption
 from tests.configurations import written
@@ -565,17 +566,14 @@ class Kept(list[Any]):
         return self[0]
 
 
-@pytest.mark.parametrize(("commanded_ns", "fault"), [(0, "DRIVE_NOT_ENABLED"), (10**10, "NONE")])
-def test_what_a_stop_did_to_the_drive_is_no_fault_in_the_table_either(commanded_ns: int, fault: str) -> None:
-    """It stood there in red, beside the words that the run was stopped."""
+def result_of(fault: Fault, commanded_ns: int, state_after: str, own_state: str) -> RunResult:
+    """Of a run that ended with that fault."""
     records = np.zeros(100, dtype_of(LogRecord)).view(np.recarray)
-    records.fault, records.phase = Fault.DRIVE_NOT_ENABLED, AxisPhase.DISABLING
+    records.fault, records.phase = fault, AxisPhase.DISABLING
     records.time_ns = 10**10 + np.arange(len(records)) * 1_000_000
     state = SimpleNamespace(fault_drive_error=0, fault_encoder_error=0, fault_slot_ns=0, fault_value=0.0)
     block = SimpleNamespace(state=[state], histograms=np.zeros((4, 9), int), port=[SimpleNamespace(last_errno=0)])
-    loop = SimpleNamespace(
-        block=block, verdict=lambda: (Fault.DRIVE_NOT_ENABLED, 0.0), stop_requested=True, lost_records=0
-    )
+    loop = SimpleNamespace(block=block, verdict=lambda: (fault, 0.0), stop_requested=True, lost_records=0)
     words = FaultText("it is off", "its enable input", "check it")
     watch: Any = SimpleNamespace(
         loop=loop,
@@ -593,5 +591,21 @@ def test_what_a_stop_did_to_the_drive_is_no_fault_in_the_table_either(commanded_
     )
     session = Session.__new__(Session)
     session._kind = SimpleNamespace(fault_text=lambda *_: words, load_row=lambda share: ("bus load", ""))
-    result = session._result(watch, Mock(), "switch on disabled", 0.1)
+    return session._result(watch, Mock(), state_after, 0.1, own_state)
+
+
+@pytest.mark.parametrize(("commanded_ns", "fault"), [(0, "DRIVE_NOT_ENABLED"), (10**10, "NONE")])
+def test_what_a_stop_did_to_the_drive_is_no_fault_in_the_table_either(commanded_ns: int, fault: str) -> None:
+    """It stood there in red, beside the words that the run was stopped."""
+    result = result_of(Fault.DRIVE_NOT_ENABLED, commanded_ns, "switch on disabled", "switch on disabled")
     assert (result.summary.fault, result.fault.name) == (fault, fault)
+
+
+@pytest.mark.parametrize("own_state", ["switch on disabled", "unknown: no answer"])
+def test_a_drive_of_an_arm_that_reads_off_is_no_emergency(own_state: str) -> None:
+    """One that is lost costs the others their heartbeat: their watchdogs stop them, which the loop does not see."""
+    text = result_of(Fault.OFF_TIMEOUT, 0, "wrist: unknown: no answer", own_state).fault_text
+    assert text is not None
+    is_off = own_state == "switch on disabled"
+    assert ("it reads switch on disabled now" in text.happened) is is_off
+    assert (text.next_step == "check it") is not is_off
