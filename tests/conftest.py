@@ -27,12 +27,15 @@ if os.environ.get("NUMBA_DISABLE_JIT") == "1":
 from jointctl.drivers import stop_note
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.hil.canopen import dictionary, encoder_node
+from jointctl.tools import drawing
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.recording import report_page
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
+from tests.page_figures import NO_PICTURE
 from tests.places import CONFIGS, ROOT
 from tests.python_process import Finished
 from tests.tiers import tier_of
@@ -145,6 +148,21 @@ def empty_bus(settings_of_virtual_joint: CanopenSettings) -> Iterator[DeviceOnBu
 def virtual_config() -> Any:
     """configs/virtual.toml."""
     return load_config(CONFIGS / "virtual.toml")
+
+
+@pytest.fixture
+def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made but not drawn, which takes nine tenths of their time: each picture is an empty one.
+
+    For the tests of a module that are not marked `draws`.
+    """
+
+    def save(_: object, target: Any, **how: Any) -> None:
+        target.write(NO_PICTURE[how["format"]])
+
+    if request.node.get_closest_marker("draws") is None:
+        for module in (drawing, report_page):
+            monkeypatch.setattr(module, "save_figure", save)
 
 
 @pytest.fixture

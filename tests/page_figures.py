@@ -6,6 +6,8 @@ import re
 
 from jointctl.tools.drawing import EITHER_WAY
 
+NO_PICTURE: dict[str, str | bytes] = {"svg": "<svg></svg>", "png": b""}  # by format, for tests that look at none
+
 
 def svgs(html: str) -> list[str]:
     """Every figure of the page; an <img> would stay white on a dark page."""

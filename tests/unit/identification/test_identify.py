@@ -28,6 +28,8 @@ from jointctl.tools.verbs.validate import validate
 from tests.page_figures import foreign_colours, svgs
 from tests.unit.identification.synthetic_friction import output, write_sweep
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 # --- The verb identify: what it writes, what it leaves alone, what it says ---
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
 VALUES = {
@@ -55,6 +57,7 @@ def config(tmp_path):
     return path
 
 
+@pytest.mark.draws
 def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep):
     out, page = output(), sweep.parent / "found.html"
     assert identify(sweep, out, options=QUICK, report=page) == 0
@@ -79,6 +82,7 @@ def test_points_that_are_left_out_are_told_even_to_who_wants_no_progress(sweep):
     assert "written:" not in out.stderr.getvalue()
 
 
+@pytest.mark.draws
 def test_identify_writes_a_section_a_report_and_pictures_beside_the_data(sweep):
     out = output()
     assert identify(sweep, out, options=QUICK) == 0
@@ -365,6 +369,7 @@ def test_damaged_limits_of_a_sidecar_are_named(tmp_path, limits):
 
 
 # --- The verb validate: the error of a model on other data, and friction that has grown ---
+@pytest.mark.draws
 def test_validate_reports_the_error_on_other_data(config, tmp_path):
     other = write_sweep(tmp_path / "other.csv", seed=9)
     out = output(json=True)

@@ -42,6 +42,7 @@ from tests.places import PUBLIC_DATA
 from tests.unit.identification.synthetic_friction import output
 from tests.unit.identification.synthetic_motion import FORMAT, RATIO, TrueJoint, motion_columns, read, write_table
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SETTINGS = MotionSettings()
 
 
@@ -503,6 +504,7 @@ def test_the_python_interface_gives_the_fit_and_writes_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["move.csv"]
 
 
+@pytest.mark.draws
 def test_the_verb_writes_section_pictures_page_and_report(tmp_path, config):
     joint = TrueJoint(load_coulomb=0.2, coulomb_perK=0.01)
     data = write_table(tmp_path / "move.csv", motion_columns(joint, seconds=40.0, warming_K=25.0))
@@ -525,10 +527,23 @@ def test_the_verb_writes_section_pictures_page_and_report(tmp_path, config):
         assert word in html
     for end in ("", ".residuals", ".families"):
         assert (tmp_path / f"move.friction{end}.png").read_bytes().startswith(b"\x89PNG")
-    # a later curve without them takes them away: they belong to the curve that they were found with
+
+
+def test_a_curve_without_load_and_temperature_takes_those_of_an_earlier_one_away(tmp_path, config):
+    """They belong to the curve that they were found with."""
+    document = tomlkit.parse(config.read_text())
+    document["friction"] |= {
+        "load": {"coulomb": 0.2},
+        "temperature": {"coulomb_pK": 0.01, "reference_degC": 40.0, "lowest_degC": 25.0, "highest_degC": 55.0},
+    }
+    config.write_text(tomlkit.dumps(document))
+    before = load_config(config).friction
+    assert before.load.coulomb == 0.2
+    assert before.temperature.coulomb_pK == 0.01
     plain = write_table(tmp_path / "plain.csv", motion_columns(TrueJoint(), seconds=40.0, seed=2))
     identify(plain, output(), into=config, given=replace(FORMAT, ratio=121.0), options=Options())
-    assert "temperature" not in tomlkit.parse(config.read_text()).unwrap()["friction"]
+    after = tomlkit.parse(config.read_text()).unwrap()["friction"]
+    assert not {"load", "temperature"} & set(after)
     assert load_config(config).friction.lugre is not None
 
 

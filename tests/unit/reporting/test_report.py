@@ -47,6 +47,8 @@ from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
 from tests.page_figures import foreign_colours, svgs
 from tests.sessions import output
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 # --- One style for files and pages: PNG on white, SVG in the colours of the page ---
 def a_verdict(number: int) -> Verdict:
@@ -65,6 +67,7 @@ def small() -> Any:
         return figure
 
 
+@pytest.mark.draws
 def test_one_figure_is_a_png_on_white_and_an_svg_in_the_colours_of_the_page(tmp_path: Path) -> None:
     import matplotlib.image
 
@@ -79,6 +82,7 @@ def test_one_figure_is_a_png_on_white_and_an_svg_in_the_colours_of_the_page(tmp_
     assert save_png(figure, tmp_path / "new" / "a.png").read_bytes() == png(figure)
 
 
+@pytest.mark.draws
 def test_powers_of_ten_are_letters_and_a_name_with_dollars_is_no_formula() -> None:
     with canvas(3.0, "joint $a_1$") as figure:
         wide, narrow = figure.subplots(1, 2)
@@ -99,6 +103,7 @@ def test_powers_of_ten_are_letters_and_a_name_with_dollars_is_no_formula() -> No
     assert not [words for words in found if "mathdefault" in words]
 
 
+@pytest.mark.draws
 def test_a_colour_of_its_own_or_black_text_would_be_found() -> None:
     figure = small()
     figure.axes[0].set_xlabel("here", color="#000000")
@@ -114,6 +119,7 @@ def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         save_png(small(), tmp_path / "file" / "a.png")
 
 
+@pytest.mark.draws
 @pytest.mark.parametrize(
     ("low", "high", "labels"),
     [
@@ -138,6 +144,7 @@ def test_a_logarithmic_axis_has_labels_that_do_not_overlap(low: float, high: flo
         assert within == labels
 
 
+@pytest.mark.draws
 def test_the_boxes_of_a_study_follow_the_page() -> None:
     plants = tuple(
         PlantResult(i, "lugre", 19, tuple(ErrorFigures("", *(0.1 * (i + k + 1),) * 8) for k in range(2)))
@@ -147,6 +154,7 @@ def test_the_boxes_of_a_study_follow_the_page() -> None:
     assert foreign_colours(svg_figure(figure, "boxes").svg) == set()
 
 
+@pytest.mark.draws
 @pytest.mark.parametrize("count", [12, MANY + 1])
 def test_the_points_of_a_campaign_follow_the_page_or_are_legible_on_it(count: int) -> None:
     found = [a_verdict(number) for number in range(count)]
@@ -155,6 +163,7 @@ def test_the_points_of_a_campaign_follow_the_page_or_are_legible_on_it(count: in
     assert ("data:image/png" in svg) is (count > MANY)
 
 
+@pytest.mark.draws
 def test_a_campaign_in_which_no_drive_was_switched_off_has_a_picture() -> None:
     assert png(campaign_figure([replace(a_verdict(1), off_s=None)], 1.0))
 
@@ -296,6 +305,7 @@ def made(paths: list[Path], out: Path | None = None) -> str:
     return Path(json.loads(said.getvalue())["report"]).read_text()
 
 
+@pytest.mark.draws
 def test_a_report_of_one_log_needs_nothing_else(tmp_path: Path) -> None:
     html = made([write_log(tmp_path / "run.mcap", run_records())])
     checker = check(html)
@@ -357,6 +367,7 @@ def test_only_what_was_used_is_drawn() -> None:
     assert "over velocity" not in drawn(records)
 
 
+@pytest.mark.draws
 def test_a_run_that_never_tracked_is_reported_too(tmp_path: Path) -> None:
     records = run_records()
     records.phase = AxisPhase.WAITING
@@ -365,8 +376,11 @@ def test_a_run_that_never_tracked_is_reported_too(tmp_path: Path) -> None:
     assert "never tracked" in html
 
 
+@pytest.mark.draws
 def test_colours_follow_the_page(tmp_path: Path) -> None:
-    html = made([write_log(tmp_path / "run.mcap", run_records())])
+    records = run_records()
+    records.network_torque_Nm, records.observer_torque_Nm = 1.0, 2.0
+    html = made([write_log(tmp_path / "run.mcap", records)])
     body = html[html.index("<svg") :]
     assert "var(--blue)" in body
     assert not [colour for colour in COLOURS.values() if colour in body]
@@ -374,6 +388,7 @@ def test_colours_follow_the_page(tmp_path: Path) -> None:
         assert html.count(f"--{name}: ") == 3  # light, dark, print
 
 
+@pytest.mark.draws
 def test_two_runs_are_compared_at_the_same_trajectory_time(tmp_path: Path) -> None:
     first, second = run_records(), run_records(900, rate_Hz=500.0, from_s=0.5)
     second.time_ns += 77_000_000_000  # another day: only trajectory time counts
@@ -403,6 +418,14 @@ def arm_logs(folder: Path, joints: int, arms: int = 1) -> list[Path]:
     return paths
 
 
+@pytest.fixture
+def side_by_side_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures of each run by itself."""
+    monkeypatch.setattr("jointctl.tools.recording.report_figures.run_figures", lambda _: [])
+
+
+@pytest.mark.draws
+@pytest.mark.usefixtures("side_by_side_alone")
 def test_joints_of_one_arm_are_shown_together_without_differences(tmp_path: Path) -> None:
     html = made(arm_logs(tmp_path, MOST_LOGS))  # a legend that leaves no room for axes is a warning, which fails
     check(html)
@@ -420,6 +443,8 @@ def test_two_joints_of_one_arm_are_not_taken_from_each_other(tmp_path: Path) -> 
     assert ">difference<" in made([write_log(tmp_path / f"{i}.mcap", run_records()) for i in range(2)])
 
 
+@pytest.mark.draws
+@pytest.mark.usefixtures("side_by_side_alone")
 def test_joints_of_two_arms_are_compared(tmp_path: Path) -> None:
     html = made(arm_logs(tmp_path, 2, arms=2))
     assert "axis1 less arm-1." in html
@@ -488,6 +513,7 @@ def test_logs_of_one_name_are_told_apart() -> None:
     assert log_names([Path("a/run.mcap"), Path("b/run.mcap"), Path("c.mcap")]) == ["run (1)", "run (2)", "c"]
 
 
+@pytest.mark.draws
 def test_the_page_takes_every_block(tmp_path: Path) -> None:
     table = PageTable(["<name>", "value"], [["a", "1.5"], ["b", "-2 %"]], "caption", {1: "error"})
     picture = Figure("a dot", '<svg><circle r="1"/></svg>')
