@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -41,7 +44,9 @@ from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import changed, written
+from tests.page_figures import foreign_colours, svgs
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 IN_LOCKSTEP = ResponseOptions(lockstep=True)
 STIFF: dict[str, Any] = {"virtual__reducer_knees_Nm": (), "virtual__reducer_stiffness_beyond_Nmprad": ()}
 LIGHT: dict[str, Any] = {  # 0.3 kg m^2 that break away at 10 Nm
@@ -59,6 +64,7 @@ def outputs(*, json_too: bool = True) -> tuple[Output, io.StringIO, io.StringIO]
     return Output(json=json_too, stdout=out, stderr=err), out, err
 
 
+@pytest.mark.draws
 def test_the_response_of_a_soft_joint_names_both_masses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     output, out, _ = outputs()
@@ -83,20 +89,46 @@ def friction_step(folder: Path, *, resume: bool = False) -> Tune:
     return job
 
 
-@pytest.fixture
-def wrong(tmp_path: Path) -> Path:
-    """A joint whose inertia is 1.6 times what its configuration says, with lower gains than it could have."""
-    return written(
-        tmp_path / "joint.toml", "precise", joint__inertia_kgm2=1.3125, virtual__inertia_scale=1.6, control__kp=900.0,
-        control__kv=60.0, control__observer_radps=20.0, control__learning=None, virtual__gravity_Nm=4.0,
+@dataclass(frozen=True)
+class Tuned:
+    """A joint whose inertia is 1.6 times what its configuration said, with lower gains than it could have, tuned."""
+
+    before: Config
+    path: Path
+    printed: dict[str, Any]
+
+    def ended_before_its_gains(self, folder: Path) -> Path:
+        """The configuration as it was, in a folder of its own, and the steps that --resume goes on with."""
+        path = folder / "joint.toml"
+        path.write_text(self.before.text)
+        shutil.copytree(self.path.with_suffix(".tune"), path.with_suffix(".tune"))
+        change_steps(path, lambda state: [state.pop(name) for name in ("gains", "verification")])
+        return path
+
+
+def change_steps(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """What a tune has kept of its steps, changed."""
+    steps = path.with_suffix(".tune") / "steps.json"
+    state = json.loads(steps.read_text())
+    change(state)
+    steps.write_text(json.dumps(state))
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Tuned:
+    path = written(
+        tmp_path_factory.mktemp("tuned") / "joint.toml", "precise", joint__inertia_kgm2=1.3125,
+        virtual__inertia_scale=1.6, control__kp=900.0, control__kv=60.0, control__observer_radps=20.0,
+        control__learning=None, virtual__gravity_Nm=4.0,
     )  # fmt: skip
-
-
-def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
-    text, before = wrong.read_text(), load_config(wrong)
+    before = load_config(path)
     output, out, _ = outputs()
     assert tune(before, output, options=TuneOptions(lockstep=True)) == 0
-    after = load_config(wrong)
+    return Tuned(before, path, json.loads(out.getvalue()))
+
+
+def test_a_tune_finds_the_joint_and_writes_what_is_better(tuned: Tuned) -> None:
+    before, after, text = tuned.before, load_config(tuned.path), tuned.path.read_text()
     assert after.joint.inertia_kgm2 == pytest.approx(2.1, rel=0.03)
     assert after.joint.gravity_Nm == pytest.approx(4.0, rel=0.3)
     assert after.margin.loop_delay_s is not None
@@ -106,13 +138,15 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
     assert plant_settings(after)["inertia_kgm2"] == pytest.approx(plant_settings(before)["inertia_kgm2"], rel=1e-4)
     true = changed(after, joint__inertia_kgm2=2.1, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
     assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
-    found = json.loads(out.getvalue())["verification"]
+    found = tuned.printed["verification"]
     assert found["after"]["rmse_mrad"] < 0.5 * found["before"]["rmse_mrad"]
-    comments = [line.split("#", 1)[1].rstrip() for line in text.splitlines() if "#" in line]
-    assert all(comment in wrong.read_text() for comment in comments)
-    folder = wrong.with_suffix(".tune")
-    assert "Bode plot" in (folder / "report.html").read_text()
-    assert (folder / "before.toml").read_text() == text
+    comments = [line.split("#", 1)[1].rstrip() for line in before.text.splitlines() if "#" in line]
+    assert all(comment in text for comment in comments)
+    folder = tuned.path.with_suffix(".tune")
+    page = (folder / "report.html").read_text()
+    assert "Bode plot" in page
+    assert [foreign_colours(svg) for svg in svgs(page)] == [set()] * 3
+    assert (folder / "before.toml").read_text() == before.text
 
 
 @pytest.mark.parametrize(
@@ -311,23 +345,26 @@ def test_steps_that_mean_nothing_are_refused(tmp_path: Path, monkeypatch: pytest
         resumed(path, load_config(path))
 
 
-def test_a_file_that_was_changed_during_the_tune_is_left_as_it_is(wrong: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_was_changed_during_the_tune_is_left_as_it_is(
+    tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A limit that its user has narrowed in the meantime must not be as wide again, nor count for steps before it."""
-    config, narrower = load_config(wrong), wrong.read_text().replace("position_max_rad = 0.7", "position_max_rad = 0.5")
+    path = tuned.ended_before_its_gains(tmp_path)
+    config, narrower = load_config(path), path.read_text().replace("position_max_rad = 0.7", "position_max_rad = 0.5")
     assert narrower != config.text
     begin = Tune.run
 
     def edited(job: Tune) -> int:
-        wrong.write_text(narrower)  # while the question is open
+        path.write_text(narrower)  # while the question is open
         return begin(job)
 
     monkeypatch.setattr(Tune, "run", edited)
     with pytest.raises(DataError, match="was changed during the tune, and is left as it is"):
-        tune(config, outputs()[0], options=TuneOptions(lockstep=True))
-    assert wrong.read_text() == narrower
-    assert "95 %" in (wrong.with_suffix(".tune") / "tuned.toml").read_text()
+        tune(config, outputs()[0], options=TuneOptions(lockstep=True, resume=True))
+    assert path.read_text() == narrower
+    assert "95 %" in (path.with_suffix(".tune") / "tuned.toml").read_text()
     with pytest.raises(DataError, match="is of another configuration"):
-        resumed(wrong, load_config(wrong))
+        resumed(path, load_config(path))
 
 
 def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(tmp_path: Path) -> None:
@@ -383,44 +420,43 @@ def test_slow_plateaus_that_swing_are_left_out(
         friction_step(tmp_path)._step_friction()
 
 
-def test_a_tune_chooses_the_law_of_the_paper_where_it_is_wanted(wrong: Path) -> None:
+def test_a_tune_chooses_the_law_of_the_paper_where_it_is_wanted(tuned: Tuned, tmp_path: Path) -> None:
+    path = tuned.ended_before_its_gains(tmp_path)
     output, out, _ = outputs()
-    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, law="paper")) == 0
-    tuned = load_config(wrong)
-    assert (tuned.control.kind, tuned.control.observer_radps) == ("computed_torque_rbf", 0.0)
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True, law="paper", resume=True)) == 0
+    control = load_config(path).control
+    assert (control.kind, control.observer_radps) == ("computed_torque_rbf", 0.0)
     found = json.loads(out.getvalue())["verification"]
     assert found["after"]["rmse_mrad"] < found["before"]["rmse_mrad"]
 
 
-def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:
-    output, *_ = outputs()
-    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, objective="quiet")) == 0
-    first, folder = wrong.read_text(), wrong.with_suffix(".tune")
-    wrong.write_text((folder / "before.toml").read_text())
-    state = json.loads((folder / "steps.json").read_text())
-    for name in ("gains", "verification"):  # as if it had ended before them
-        del state[name]
-    state["response"]["legs"] = 77
-    (folder / "steps.json").write_text(json.dumps(state))
+def test_a_tune_goes_on_where_it_ended(tuned: Tuned, tmp_path: Path) -> None:
+    path = tuned.ended_before_its_gains(tmp_path)
+    change_steps(path, lambda state: state["response"].update(legs=77))
     output, _, err = outputs()
-    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, objective="quiet", resume=True)) == 0
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True, resume=True)) == 0
     assert "friction: done before" in err.getvalue()
-    assert wrong.read_text() == first.replace("of 12 legs", "of 77 legs")
+    assert path.read_text() == tuned.path.read_text().replace("of 12 legs", "of 77 legs")
+    kv = load_config(path).control.kv
     with pytest.raises(DataError, match="is of another configuration or torque than"):
-        tune(load_config(wrong), output, options=TuneOptions(lockstep=True, torque_Nm=50.0, resume=True))
+        tune(load_config(path), output, options=TuneOptions(lockstep=True, torque_Nm=50.0, resume=True))
     output, _, err = outputs()  # another objective for what was identified
-    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, resume=True)) == 0
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True, objective="quiet", resume=True)) == 0
     assert "friction: done before" in err.getvalue()
     assert "gains: done before" not in err.getvalue()
-    assert load_config(wrong).control.kv != load_config(folder / "before.toml").control.kv
+    assert load_config(path).control.kv not in (kv, tuned.before.control.kv)
 
 
-def test_gains_that_measure_better_bring_their_own_margins(wrong: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gains_that_measure_better_bring_their_own_margins(
+    tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tuned.ended_before_its_gains(tmp_path)
     errors = iter(0.1 * 0.5**k for k in range(20))
     monkeypatch.setattr(Tune, "_verified", lambda *_: {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1})
     output, *_ = outputs()
-    silent = TerminalConsent(output, assume_yes=True)
-    job = Tune(load_config(wrong), TuneOptions(lockstep=True, refine=True), Carrier(output, silent, None), wrong.parent)
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    options = TuneOptions(lockstep=True, refine=True, resume=True)
+    job = Tune(load_config(path), options, carrier, path.with_suffix(".tune"))
     job.carry_out()
     gains, kept = job.gains, job.state["gains"]
     assert gains is not None
