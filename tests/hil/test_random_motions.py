@@ -111,7 +111,7 @@ def test_creep_tells_a_law_that_sticks_from_one_that_does_not() -> None:
 def test_a_study_has_motions_that_never_repeat(flexible: bool) -> None:
     base = shipped("precise", trajectory__duration_s=6.0)
     controllers = named(("realistic",) if flexible else ("precise",))
-    data = {"plants": 2, "after_s": 2.0, "scenario": "point_to_point", "plant": {"flexible": flexible}}
+    data = {"plants": 1, "after_s": 2.0, "scenario": "point_to_point", "plant": {"flexible": flexible}}
     result = run_study(base, controllers, checked(data, "test"), workers=Workers(1))
     name = result.controllers[0]
     assert result.faults(name) == 0

@@ -389,7 +389,7 @@ def test_a_law_for_flexible_joints_gets_gains_for_each_of_them(base: Config) -> 
 
 @pytest.mark.parametrize(("law", "rmse_mrad"), [("encoder", 0.4), ("joint_encoder_alone", 1.0)])
 def test_with_one_encoder_the_gains_are_those_of_that_encoder(base: Config, law: str, rmse_mrad: float) -> None:
-    settings = checked({"plants": 3, "seed": 5, "after_s": 1.0, "plant": {"flexible": True, "law": law}}, "test")
+    settings = checked({"plants": 2, "seed": 5, "after_s": 1.0, "plant": {"flexible": True, "law": law}}, "test")
     found = run_study(base, named(("realistic",)), settings, workers=Workers(1))
     assert found.faults("realistic") == 0
     assert np.max(found.values("realistic", "true_rmse_mrad")) < rmse_mrad

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -219,10 +220,6 @@ def believed(**changes: Any) -> Config:
     return shipped("realistic", **changes)
 
 
-def chosen(config: Config) -> ChosenGains:
-    return gains_of_file(config, loop_settings(config)[0])
-
-
 def with_encoders(config: Config, encoders: Encoders) -> Config:
     """The encoder on the motor alone, or that on the link alone."""
     if encoders == Encoders.BOTH:
@@ -233,6 +230,13 @@ def with_encoders(config: Config, encoders: Encoders) -> Config:
     return alone if encoders == Encoders.MOTOR else changed(
         alone, encoder__side="joint", encoder__counts_per_turn=counts
     )  # fmt: skip
+
+
+@cache
+def chosen(encoders: Encoders, **changes: float) -> ChosenGains:
+    """Searched once; several tests ask for those of the same joint."""
+    config = with_encoders(believed(**changes), encoders)
+    return gains_of_file(config, loop_settings(config)[0])
 
 
 @pytest.mark.parametrize("encoders", list(Encoders))
@@ -246,7 +250,7 @@ def with_encoders(config: Config, encoders: Encoders) -> Config:
     ],
 )
 def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any], encoders: Encoders) -> None:
-    found = chosen(with_encoders(believed(**changes), encoders))
+    found = chosen(encoders, **changes)
     best = found.best
     assert found.missed == {}
     assert best.settings.encoders == encoders
@@ -269,24 +273,23 @@ def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any],
     ],
 )
 def test_chosen_gains_are_not_refused_by_the_gate_of_the_same_file(encoders: Encoders, wanted: dict[str, Any]) -> None:
-    usual, config = (with_encoders(believed(**changes), encoders) for changes in ({}, wanted))
+    config = with_encoders(believed(**wanted), encoders)
     minimum_deg, (settings, _) = config.margin.min_phase_margin_deg, loop_settings(config)
-    assert meets(margins(chosen(config).best.settings), minimum_deg)
-    of_usual = replace(chosen(usual).best.settings, largest_s=settings.largest_s)
+    assert meets(margins(chosen(encoders, **wanted).best.settings), minimum_deg)
+    of_usual = replace(chosen(encoders).best.settings, largest_s=settings.largest_s)
     assert not meets(margins(of_usual), minimum_deg)
 
 
 def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> None:
-    config = with_encoders(believed(margin__min_phase_margin_deg=80.0), Encoders.MOTOR)
-    found = chosen(config)
+    found = chosen(Encoders.MOTOR, margin__min_phase_margin_deg=80.0)
     assert found.missed
     assert found.changes()["kv"] > 0.8 * LEAST_KV_1ps
-    assert not chosen(with_encoders(believed(), Encoders.MOTOR)).missed
+    assert not chosen(Encoders.MOTOR).missed
 
 
 def test_a_light_motor_that_is_late_gets_a_filter_far_below_its_resonance() -> None:
     """It bears more behind one."""
-    found = chosen(believed(reducer__motor_inertia_kgm2=0.15, margin__loop_delay_s=1.7e-3))
+    found = chosen(Encoders.BOTH, reducer__motor_inertia_kgm2=0.15, margin__loop_delay_s=1.7e-3)
     assert not found.missed
     assert found.changes()["velocity_cutoff_Hz"] < 20.0
     assert found.changes()["kv"] > 5.0
@@ -295,7 +298,9 @@ def test_a_light_motor_that_is_late_gets_a_filter_far_below_its_resonance() -> N
 
 
 def test_more_delay_leaves_smaller_gains() -> None:
-    found = [chosen(believed(margin__loop_delay_s=delay_s)).changes()["kv"] for delay_s in (0.5e-3, 1.5e-3, 3e-3)]
+    assert 0.5e-3 < loop_settings(believed())[0].delay_s < 2.5e-3
+    delays: list[dict[str, float]] = [{"margin__loop_delay_s": 0.5e-3}, {}, {"margin__loop_delay_s": 2.5e-3}]
+    found = [chosen(Encoders.BOTH, **delay).changes()["kv"] for delay in delays]
     assert found == sorted(found, reverse=True)
     assert found[-1] < 0.7 * found[0]
 
