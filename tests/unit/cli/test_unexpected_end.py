@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -29,6 +30,7 @@ from jointctl.tools.verbs.start import FREE_DESCRIPTORS
 from jointctl.tools.verbs.verb_options import Verb, Verbs
 from tests.configurations import shipped, written
 from tests.places import ROOT
+from tests.python_process import Finished
 from tests.sessions import Terminal, output
 
 # --- What no verb has foreseen, and a computer that has too little of something: one line and a documented code ---
@@ -116,11 +118,13 @@ def test_an_unexpected_error_is_one_line(
         (["new", "{}.toml", "--no-input"], 8), (["params", "dump", "virtual", "-o", "{}.dcf"], 8),
     ],
 )  # fmt: skip
-def test_a_name_that_is_too_long_is_no_fault_of_jointctl(tmp_path: Path, words: list[str], code: int) -> None:
-    done = ended(*(word.format("x" * 300) for word in words), cwd=tmp_path)
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert (done.returncode, "fault of jointctl" in line) == (code, False)
-    assert "File name too long" in line
+def test_a_name_that_is_too_long_is_no_fault_of_jointctl(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jointctl: Callable[..., Finished], words: list[str], code: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = jointctl(*(word.format("x" * 300) for word in words))
+    done.refused(code, "File name too long")
+    assert "fault of jointctl" not in done.err
 
 
 @pytest.mark.parametrize(
@@ -132,12 +136,14 @@ def test_a_name_that_is_too_long_is_no_fault_of_jointctl(tmp_path: Path, words: 
         (["new", "a.toml", "--from", "", "--no-input"], 3, ".toml: no such file"),  # a script's variable that is empty
     ],
 )  # fmt: skip
-def test_odd_values_are_named(tmp_path: Path, words: list[str], code: int, part: str) -> None:
+def test_odd_values_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jointctl: Callable[..., Finished], words: list[str], code: int,
+    part: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     written(tmp_path / "own.toml", "precise")
-    done = ended(*words, cwd=tmp_path)
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert (done.returncode, part in line) == (code, True), line
+    jointctl(*words).refused(code, part)
 
 
 def test_a_broken_pipe_in_a_verb_is_no_silent_end() -> None:
