@@ -183,6 +183,7 @@ def test_a_response_alone_of_a_light_joint_has_the_law_of_a_tune(
     assert found["half"] < 0.1
 
 
+@pytest.mark.slow("the whole tune of a soft joint once more, with a file that is wrong")
 def test_a_motor_that_weighs_more_by_its_file_than_the_whole_joint_is_found_all_the_same(tmp_path: Path) -> None:
     """0.84 kg m^2, of which 0.3 are the motor's; by the file they are 2.1 and 0.95."""
     wrong = {"virtual__inertia_scale": 0.4, "virtual__motor_side_inertia_kgm2": 0.3}
@@ -378,6 +379,7 @@ def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(
     require_margin(tuned)
 
 
+@pytest.mark.slow("the whole tune of a soft joint once more, with the other encoder")
 def test_a_tune_of_a_soft_joint_with_its_encoder_on_the_link_alone_passes_the_gate(tmp_path: Path) -> None:
     control = load_config(shipped_config("precise")).control.model_dump(mode="json", exclude_none=True)
     path = written(

@@ -401,29 +401,36 @@ def test_learning_is_judged_with_the_worst_joint() -> None:
         assert (": diverges" in out) is not converges
 
 
+KEYS = {"kp", "kv", "observer_radps", "observer_delay_cycles", "velocity_cutoff_Hz"}
+
+
 def test_gains_are_chosen_on_request_for_the_law_of_the_file() -> None:
     shown, _, _ = run_check(shipped("realistic", joint_encoder=None, encoder__side="joint"), choose_gains=True)
     assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, observer_radps = [\d.]+, ", shown)
     assert re.search(r"velocity_cutoff_Hz = \d\.\d+ ", shown)  # the resonance lies between
-    shown, _, code = run_check(shipped("realistic"), choose_gains=True, json=True)
-    assert code == 0
-    chosen = json.loads(shown)["chosen_gains"]
-    assert chosen["met"] is True
-    keys = {"kp", "kv", "observer_radps", "observer_delay_cycles", "velocity_cutoff_Hz"}
-    assert set(chosen["changes"]) == {*keys, "link_cutoff_Hz"}
-    assert chosen["phase_margin_deg"] > 30.0
     impossible = shipped("precise", margin__min_phase_margin_deg=80.0)
     shown, _, code = run_check(impossible, choose_gains=True)
     assert (code, "NOT what is asked for" in shown) == (9, True)
     shown, _, code = run_check(shipped("paper"), choose_gains=True)
     assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, lyapunov_q = [\d.]+ ", shown)
-    for config, lowered in ((shipped("precise"), set()), (rigid_law_behind_a_reducer("encoder"), {"learning"})):
-        chosen = json.loads(run_check(config, choose_gains=True, json=True)[0])["chosen_gains"]
-        assert set(chosen["changes"]) == keys | lowered
-        assert chosen["met"] is True
+    shown, _, code = run_check(shipped("precise"), choose_gains=True, json=True)
+    chosen = json.loads(shown)["chosen_gains"]
+    assert (code, chosen["met"], set(chosen["changes"])) == (0, True, KEYS)
+    assert chosen["phase_margin_deg"] > 30.0
     other = shipped("paper", control__kind="computed_torque")
     with pytest.raises(ConfigurationError, match=r"gains are chosen for control.kind \(=computed_torque\) of flexible"):
         run_check(other, choose_gains=True)
+
+
+@pytest.mark.slow("searches of soft joints")
+def test_gains_that_are_chosen_behind_a_reducer_have_what_that_law_has_besides() -> None:
+    shown, _, code = run_check(shipped("realistic"), choose_gains=True, json=True)
+    chosen = json.loads(shown)["chosen_gains"]
+    assert (code, chosen["met"], set(chosen["changes"])) == (0, True, {*KEYS, "link_cutoff_Hz"})
+    assert chosen["phase_margin_deg"] > 30.0
+    shown, *_ = run_check(rigid_law_behind_a_reducer("encoder"), choose_gains=True, json=True)
+    chosen = json.loads(shown)["chosen_gains"]
+    assert (chosen["met"], set(chosen["changes"])) == (True, {*KEYS, "learning"})
 
 
 def test_a_torque_that_does_not_hold_the_joint_is_no_chatter() -> None:

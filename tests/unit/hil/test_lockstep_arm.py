@@ -138,6 +138,7 @@ def test_gravity_helps_every_joint_and_the_whole_model_the_quick_ones_more() -> 
     assert np.all(whole < 0.65 * independent)
 
 
+@pytest.mark.slow("gains are searched for each of its joints")
 def test_an_arm_of_flexible_joints_moves_within_its_margins_and_the_model_helps_it() -> None:
     """Slowly: at higher speed the kinematic error of the reducers is what is left."""
     shipped = load_arm(SHIPPED_ARM)
