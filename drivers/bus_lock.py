@@ -383,6 +383,11 @@ def _has_lock(interface: str) -> bool:
     return sys.platform == "linux" and interface != _IN_PROCESS
 
 
+def stop_is_noted(interface: str, channel: str) -> bool:
+    """For a program that has not got so far as to be asked."""
+    return _has_lock(interface) and stopped(lock_name(interface, channel))
+
+
 def wait_for_answers(holders: Iterable[Holder], timeout_s: float = ANSWER_S) -> None:
     """Until each has answered or left, `timeout_s` at most."""
     waiting = list(holders)

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock, stop_is_noted
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
 from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.errors import DeviceError, MotionFault, UsageError
@@ -289,7 +289,8 @@ def _locked(
 ) -> Iterator[Control]:
     """The locks of all buses: a stop by any of them is one of the whole program.
 
-    A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.
+    A `KeyboardInterrupt` that no one below has put into words leaves with `StopSignals.by_command` as its text.  Before
+    the locks are there, a stop may have ended the program by signal, since it did not answer yet.
     """
     _require_no_copy()
     words = "; nothing moved"  # until the program has its locks
@@ -309,4 +310,6 @@ def _locked(
             words = ""
             yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
     except KeyboardInterrupt:
+        if words and any(stop_is_noted(*place) for place in places):
+            signals.commanded_ns = signals.commanded_ns or time.monotonic_ns()
         raise KeyboardInterrupt(f"{signals.by_command}{words}") from None

@@ -226,6 +226,29 @@ def test_a_stop_that_an_error_hides_is_not_lost(virtual_config: Any, monkeypatch
     assert tried()
 
 
+@pytest.mark.parametrize("noted", [True, False])
+def test_a_stop_that_ends_a_program_before_it_can_answer_is_named(
+    virtual_config: Any, monkeypatch: pytest.MonkeyPatch, noted: bool
+) -> None:
+    """By signal, since a busy computer had not let it get so far.  The twin is a signal of another program."""
+    bus = virtual_config.bus.model_copy(update={"channel": f"ended-{noted}-{os.getpid()}"})
+    monkeypatch.setattr(stop_note, "_ancestors", lambda: iter(()))  # the stop is another's
+    monkeypatch.setattr(stop_note, "_settled_ns", {})
+
+    def take(interface: str, channel: str, *_: object) -> None:
+        if noted:
+            stop_note.write_note(lock_name(interface, channel))
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("jointctl.tools.session.control.BusLock", take)
+    by = " by jointctl stop" if noted else ""
+    with (
+        pytest.raises(KeyboardInterrupt, match=f"^{by}; nothing moved$"),
+        in_control(virtual_config.model_copy(update={"bus": bus}), Output()),
+    ):
+        pass
+
+
 @contextmanager
 def taken(channel: str) -> Iterator[None]:
     """By another program."""
