@@ -62,8 +62,8 @@ class SwitchOff:
         self, network: canopen.Network, node: int, objects: ObjectAccess, encoder_node: int | None,
         sleep: Callable[[float], None], braking_s: float = QUICK_STOP_S,
     ) -> None:  # fmt: skip
-        """`braking_s`: how long a drive that brakes already may go on; its power is taken then."""
-        self._braking_s = braking_s
+        """`braking_s`: how long a drive that brakes already may go on, QUICK_STOP_S at least; then its power goes."""
+        self._braking_s = max(braking_s, QUICK_STOP_S)
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
@@ -113,7 +113,7 @@ class SwitchOff:
 
     def _braked(self) -> State:
         """The state after the quick stop, or the one that is left when its time is over."""
-        for _ in range(round(max(self._braking_s, QUICK_STOP_S) / POLL_S)):
+        for _ in range(round(self._braking_s / POLL_S)):
             state = state_of(self._objects)
             if state is not State.QUICK_STOP_ACTIVE:
                 break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 from unittest.mock import Mock
 
@@ -9,6 +10,7 @@ import pytest
 
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from jointctl.tools.configuration.config import Config
 from jointctl.tools.session.run_watch import RunWatch
 from jointctl.tools.session.session import Session
 from tests.unit.drivers.elmo.virtual_line import Talk
@@ -71,19 +73,25 @@ class _BrakingLoop:
         return self.polls > 0
 
 
+def braked(configs: Sequence[Config], signal: StopRequest = StopRequest.NONE, **viewer: Any) -> _BrakingLoop:
+    """What has become of the loop when its supervisor, which cannot go on, has braked the joints."""
+    session = Session.__new__(Session)
+    session.plan = Mock(configs=tuple(configs))
+    loop: Any = _BrakingLoop()
+    watch = RunWatch.__new__(RunWatch)
+    watch.around = Mock(signals=Mock(request=signal))
+    watch.display = Mock(stop_request=Mock(**{"return_value": StopRequest.NONE, **viewer}))
+    session._brake(loop, watch)
+    return loop
+
+
 @pytest.mark.parametrize("by", ["a signal", "a signal, behind a broken display", "a viewer"])
 @pytest.mark.parametrize("request_", [StopRequest.NONE, StopRequest.QUICK_STOP, StopRequest.OFF])
 def test_a_stop_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, request_: StopRequest, by: str) -> None:
     """By a signal, or the second press of STOP at the page."""
     by_signal, by_page = (StopRequest.NONE, request_) if by == "a viewer" else (request_, StopRequest.NONE)
     broken = OSError("no page") if "broken" in by else None
-    session = Session.__new__(Session)
-    session.plan = Mock(configs=(virtual_config,))
-    loop: Any = _BrakingLoop()
-    watch = RunWatch.__new__(RunWatch)
-    watch.around = Mock(signals=Mock(request=by_signal))
-    watch.display = Mock(stop_request=Mock(return_value=by_page, side_effect=broken))
-    session._brake(loop, watch)
+    loop = braked([virtual_config], by_signal, return_value=by_page, side_effect=broken)
     assert loop.polls == 0, "it is braked to the end"
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
 
@@ -93,14 +101,7 @@ def test_a_failed_supervisor_of_an_arm_waits_for_its_slowest_joint(virtual_confi
     """Not for the first one's time: that took the others out of their ramps.  The twin has no slow one."""
     at_once = dict.fromkeys(("stop_timeout_s", "release_s", "off_timeout_s"), 0.0)
     quick = virtual_config.model_copy(update={"sequence": virtual_config.sequence.model_copy(update=at_once)})
-    session = Session.__new__(Session)
-    session.plan = Mock(configs=(quick, virtual_config if slow else quick))
-    loop: Any = _BrakingLoop()
-    watch = RunWatch.__new__(RunWatch)
-    watch.around = Mock(signals=Mock(request=StopRequest.NONE))
-    watch.display = Mock(stop_request=Mock(return_value=StopRequest.NONE))
-    session._brake(loop, watch)
-    assert (loop.polls == 0) is slow
+    assert (braked([quick, virtual_config if slow else quick]).polls == 0) is slow
 
 
 # --- the loop stood still (SIGSTOP, a suspended machine) and goes on ---

@@ -356,10 +356,8 @@ def held_up_text(fault: Fault, value: float, text: FaultText, records: np.recarr
     )
 
 
-def read_off_text(fault: Fault, text: FaultText, state: str) -> FaultText:
-    """`text`, of a drive that reads `state` afterwards and is off: what the loop has not seen is no emergency then."""
-    if fault is not Fault.OFF_TIMEOUT:
-        return text
+def read_off_text(text: FaultText, state: str) -> FaultText:
+    """`text` of OFF_TIMEOUT, of a drive that is off by the `state` that it reads afterwards: that is no emergency."""
     return FaultText(
         f"{text.happened}; it reads {state} now", "its own watchdog has stopped it, or its reports were lost",
         "look at what came before it, if anything did; else check the bus",

@@ -145,7 +145,7 @@ class Session:
                     raise KeyboardInterrupt from None
                 raise
             finally:
-                self.drive_state, _ = self._made_safe(drives)
+                self.drive_state = self._common(self._made_safe(drives))
                 drives.close()
                 if guard is not None:
                     guard.release(self.drive_state)
@@ -180,10 +180,12 @@ class Session:
         """The drives of all joints, nothing sent to them yet."""
         return self._kind.open_all(self.plan.configs, self.signals.leave_if_asked, self.own is not None)
 
-    def _made_safe(self, drives: DriveGroup) -> tuple[str, list[str]]:
-        """The state of all in words, and that of each."""
-        states = drives.make_safe(asked=bool(self.signals.commanded_ns))
-        return common_state([joint.name for joint in self._joints], states), states
+    def _made_safe(self, drives: DriveGroup) -> list[str]:
+        """The state of each drive, in words."""
+        return drives.make_safe(asked=bool(self.signals.commanded_ns))
+
+    def _common(self, states: Sequence[str]) -> str:
+        return common_state([joint.name for joint in self._joints], states)
 
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
@@ -289,7 +291,7 @@ class Session:
                         each.poll()
                 time.sleep(POLL_S)
         except MotionFault as error:
-            state, _ = self._made_safe(drives)
+            state = self._common(self._made_safe(drives))
             self._log_end(watches, error)
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
@@ -307,7 +309,8 @@ class Session:
         for each in watches:
             with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
-        state, states = self._made_safe(drives)
+        states = self._made_safe(drives)
+        state = self._common(states)
         for each in watches:
             if each.around.recorder is not None:
                 each.around.recorder.end()
@@ -381,7 +384,7 @@ class Session:
                 time.sleep(POLL_S)
 
     def _result(
-        self, watch: RunWatch, report: CommissioningReport, drive_state: str, bus_load: float, own_state: str = ""
+        self, watch: RunWatch, report: CommissioningReport, drive_state: str, bus_load: float, own_state: str
     ) -> RunResult:
         """`drive_state`: of all joints, `own_state`: of this one."""
         loop, config = watch.loop, watch.config
@@ -400,7 +403,8 @@ class Session:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
             text = self._kind.fault_text(config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
-            text = read_off_text(fault, text, own_state) if is_safe(own_state) else text
+            if fault is Fault.OFF_TIMEOUT and is_safe(own_state):
+                text = read_off_text(text, own_state)
             text = watch.mode_explained(fault, text) if is_safe(drive_state) else text
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         summary = summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC)
