@@ -149,10 +149,10 @@ class DeviceOnBus:
             passed.clear()
         with can.Bus(interface="virtual", channel=self.channel) as bus:
             bus.send(pass_time(0.0))
-            while (message := bus.recv(5.0)) is not None and message.arbitration_id != TIME_PASSED:
+            while (message := bus.recv(60.0)) is not None and message.arbitration_id != TIME_PASSED:
                 pass
         for passed in open_ones:
-            passed.wait(5.0)
+            passed.wait(60.0)
 
     def stop_drive(self) -> str:
         """What `jointctl stop` does, from another end of this bus; the state in words."""
@@ -186,7 +186,7 @@ class DeviceOnBus:
                 return
             passed.clear()
             bus.send(pass_time(seconds))
-            passed.wait(5.0)
+            passed.wait(60.0)
 
         drive = CanopenDrive(bus, settings, sleep=sleep, gate=gate)
         if listened:

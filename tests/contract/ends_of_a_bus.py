@@ -16,7 +16,7 @@ from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import new
 from tests.python_process import eventually
 
-LONG_S = 10.0  # far more than is ever needed: a limit against hanging, not a measure of speed
+LONG_S = 60.0  # far more than is ever needed: a limit against hanging, not a measure of speed
 SHORT_S = 0.05
 EXTENDED, REMOTE = 0x80000000, 0x40000000
 

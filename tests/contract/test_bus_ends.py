@@ -132,7 +132,7 @@ class HubContract(BusContract):
         for number in range(3000):
             send_surely(sender, number % 0x700, b"12345678")
             assert receiver.receive() == (number % 0x700, b"12345678")
-        eventually(lambda: hub.counters["frames"] == 3000)
+        eventually(lambda: hub.counters["frames"] == 3000, 60.0)
         lost = int(hub.counters["dropped"])
         kept = 3000 - lost
         assert lost > 0
@@ -154,7 +154,7 @@ class HubContract(BusContract):
             bad.send(b"\x55\x00\x00\x00" + bytes(12))  # the twin that must pass
             assert receiver.receive() == (0x55, b"")
             assert hub.counters["malformed"] == 7
-            eventually(lambda: hub.counters["frames"] == 1)
+            eventually(lambda: hub.counters["frames"] == 1, 60.0)
             assert sorted(hub.client_counters["malformed"]) == [0, 7]
 
     def test_one_that_dies_with_unread_frames_is_removed(self, hub: VirtualBusHub, join: Any) -> None:
@@ -164,7 +164,7 @@ class HubContract(BusContract):
         assert dying.send(0x11)
         dying.close()
         assert receiver.receive() == (0x11, b"")  # its last frame still counts
-        eventually(lambda: hub.counters["clients"] == 2)
+        eventually(lambda: hub.counters["clients"] == 2, 60.0)
         for number in range(100):
             assert sender.send(number)
             assert receiver.receive() == (number, b"")
@@ -172,7 +172,7 @@ class HubContract(BusContract):
 
     def test_the_bus_ends_for_all(self, hub: VirtualBusHub, join: Any) -> None:
         end = join()
-        eventually(lambda: hub.counters["clients"] == 1)
+        eventually(lambda: hub.counters["clients"] == 1, 60.0)
         hub.stop()
         with pytest.raises((OSError, can.CanOperationError)):
             end.receive()
@@ -198,7 +198,7 @@ class TimedHubContract(HubContract):
                 taken += 1
                 assert taken < 100_000
             assert taken > 64
-            eventually(lambda: sender.send(*END))
+            eventually(lambda: sender.send(*END), 60.0)
             taking.join()
             assert came == [(number & 0x3FF, b"12345678") for number in range(taken)] + [END]
 
@@ -278,7 +278,7 @@ def test_two_canopen_networks_talk(tmp_path_factory: pytest.TempPathFactory, tim
             assert remote.sdo[0x6071].raw == -1234
             local.nmt.state = "PRE-OPERATIONAL"
             remote.nmt.state = "OPERATIONAL"
-            eventually(lambda: local.nmt.state == "OPERATIONAL")
+            eventually(lambda: local.nmt.state == "OPERATIONAL", 60.0)
         finally:
             master.disconnect()
             slave.disconnect()

@@ -190,7 +190,7 @@ class TestCanopenDrive(DriveContract):
         bench.drive.start_cyclic()
         meter = bench.drive.thermometer()
         assert meter is not None
-        found = eventually(meter.poll, 5.0)
+        found = eventually(meter.poll, 60.0)
         assert (found.temperature_degC, found.problem) == (25.0, "")
         assert bench.drive.make_safe() == self.off
 

@@ -79,7 +79,7 @@ class Line:
         self.constants, self.state = plant(step_s=1e-4, friction_kind=FrictionKind.NONE)
         device = Cia402Device(EDS, DeviceSettings(node_id=NODE), self.constants, self.state, faults)
         self.ours, self._its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.ours.settimeout(1.0)
+        self.ours.settimeout(60.0)
         self.drive = RealtimeDevice(device, self._its.fileno())
 
     def __enter__(self) -> Line:
@@ -251,8 +251,8 @@ def ends(tmp_path: Any) -> Any:
     """(hub, the controller's end, the drive's end)"""
     path = tmp_path / "bus.sock"
     with VirtualBusHub(path) as hub, connect(str(path)) as controller, connect(str(path)) as drive:
-        controller.settimeout(1.0)
-        drive.settimeout(1.0)
+        controller.settimeout(60.0)
+        drive.settimeout(60.0)
         yield hub, controller, drive
 
 

@@ -43,7 +43,7 @@ SERVER_SILENT = (
 SCOPE = "the scope"
 OVER = "over"  # the last stage: the program ends as it should, and nothing moves any more
 LAST_WORD_S = 1.0  # without it the pages fear that the joint may move
-SHOW_END_S = 12.0  # at most, for pages on a busy computer to show the end of the run
+SHOW_END_S = 20.0  # at most, for pages on a busy computer to show the end; one that is cut off tries every 5 s
 SERVER_ENDED = "{}'s server has ended: no {} shows or stops the joint"
 
 

@@ -215,7 +215,7 @@ def test_every_reader_refuses_what_is_no_file(tmp_path: Path, name: str) -> None
 STUCK = (
     "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL);"  # which `nohup pytest` has ignored
     "import sys, time, types; sys.modules['typer'] = slow = types.ModuleType('typer');"
-    "slow.__getattr__ = lambda name: (print('importing', flush=True), time.sleep(60));"
+    "slow.__getattr__ = lambda name: (print('importing', flush=True), *(time.sleep(0.02) for _ in range(6000)));"
     "import jointctl.tools.verbs.start as start; start.main()"
 )
 
@@ -223,11 +223,14 @@ STUCK = (
 def ended_while_importing(number: signal.Signals, *words: str) -> tuple[int, str]:
     """(exit code, what it said) of a verb that got this signal."""
     command = [sys.executable, "-c", STUCK, *words]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert started.stdout is not None
-    assert started.stdout.readline() == "importing\n"
-    started.send_signal(number)
-    _, said = started.communicate(timeout=20.0)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as started:
+        assert started.stdout is not None
+        assert started.stdout.readline() == "importing\n"
+        started.send_signal(number)
+        try:
+            _, said = started.communicate(timeout=100.0)
+        finally:
+            started.kill()
     return started.returncode, said
 
 

@@ -152,7 +152,7 @@ def test_one_that_has_reached_the_holder_of_the_lock_is_known_to_it() -> None:
             if delivers:
                 lock.deliver()
             with StopCall("socketcan", channel):
-                assert reached.wait(5.0)
+                assert reached.wait(60.0)
         with BusLock("socketcan", channel) as lock:
             assert lock.stopped is not delivers
             lock.settle()

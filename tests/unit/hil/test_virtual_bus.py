@@ -213,7 +213,7 @@ def test_counters(path: Path) -> None:
         record = new(WireFrame)
         record["identifier"], record["length"], record["payload"] = 0x601, 8, range(8)
         bits = 10 * frame_bits(record)
-        eventually(lambda: hub.counters["frames"] == 10)
+        eventually(lambda: hub.counters["frames"] == 10, 60.0)
         counters = hub.counters
         assert (counters["bits"], counters["busy_ns"]) == (bits, bits * 2000)
         assert (counters["clients"], counters["accepted"], counters["refused"]) == (2, 2, 0)
@@ -309,14 +309,14 @@ def test_a_file_that_is_no_socket_is_not_removed(path: Path) -> None:
 def test_clients_up_to_the_limit_and_one_more(path: Path) -> None:
     with VirtualBusHub(path) as hub:
         clients = [join(path) for _ in range(MAX_CLIENTS)]
-        eventually(lambda: hub.counters["clients"] == MAX_CLIENTS)
+        eventually(lambda: hub.counters["clients"] == MAX_CLIENTS, 60.0)
         with join(path) as refused:
             assert refused.recv(64) == b""
         assert hub.counters["refused"] == 1
         clients[0].send(FRAME)
         assert all(client.recv(64) == FRAME for client in clients[1:])
         clients.pop().close()
-        eventually(lambda: hub.counters["clients"] == MAX_CLIENTS - 1)
+        eventually(lambda: hub.counters["clients"] == MAX_CLIENTS - 1, 60.0)
         clients.append(join(path))
         clients[0].send(FRAME)
         assert all(client.recv(64) == FRAME for client in clients[1:])
@@ -329,7 +329,7 @@ def test_a_client_that_only_ends_its_sending_is_removed(path: Path) -> None:
         a.send(FRAME)
         a.shutdown(socket.SHUT_WR)
         assert b.recv(64) == FRAME
-        eventually(lambda: hub.counters["clients"] == 1)
+        eventually(lambda: hub.counters["clients"] == 1, 60.0)
         assert hub.counters["malformed"] == 0
 
 
@@ -339,7 +339,7 @@ def test_frames_of_a_dead_client_still_get_their_time_on_the_wire(path: Path) ->
             for number in range(80):  # more than a queue in the hub holds
                 a.send(bytes([number]) + bytes(15))
         assert [b.recv(64)[0] for _ in range(80)] == list(range(80))
-        eventually(lambda: hub.counters["clients"] == 1)
+        eventually(lambda: hub.counters["clients"] == 1, 60.0)
 
 
 def test_the_folder_of_the_default_path(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:

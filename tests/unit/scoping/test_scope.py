@@ -222,7 +222,7 @@ def test_the_last_stage_arrives_also_where_the_server_is_slow(
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
     feed.over()
-    reader.join(20.0)
+    reader.join(60.0)
     assert found[-1] == SETTINGS + b'{"stage": "over"}'
 
 

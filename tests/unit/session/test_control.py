@@ -132,7 +132,7 @@ def test_a_command_is_looked_on_between_its_motions(monkeypatch: pytest.MonkeyPa
         assert held.signals.looked_ns is None
         held.signals.agreed()
         before_ns = held.signals.looked_ns
-        eventually(lambda: held.signals.looked_ns != before_ns)
+        eventually(lambda: held.signals.looked_ns != before_ns, 60.0)
 
 
 def test_the_first_signal_is_the_one_that_is_named() -> None:

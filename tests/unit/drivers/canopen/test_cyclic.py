@@ -596,7 +596,7 @@ def test_sync_counts_as_anothers_unless_it_may_be_our_own_repeated(two_drives: T
     two_drives.bus.send(sync)  # of before
     two_drives.cycle(0.02)  # our own may be among what waits after a cycle without an answer
     two_drives.bus.send(sync)
-    two_drives.cycle(30.0, 0, 1, before=sync)  # repeated at once
+    two_drives.cycle(3.0, 0, 1, before=sync)  # repeated at once; the answers of before are waited for to the end
     assert list(two_drives.ports["of_another_sync"]) == [0, 0]
     two_drives.bus.send(sync)
     two_drives.cycle(30.0, 0, 1)
