@@ -84,7 +84,6 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
     """
     if sample.count == state.sample_count:
         state.sample_age_cycles += elapsed_cycles
-        state.missing_samples += elapsed_cycles
         state.good_samples = 0
         if state.sample_age_cycles > BRIDGED_CYCLES:
             radps, flexible, own = state.reference.velocity_radps, constants.law.flexible, state.law.flexible
@@ -108,7 +107,6 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
         state.frozen_samples += 1
     state.sample_count = sample.count
     state.sample_age_cycles = 0
-    state.missing_samples = max(state.missing_samples - 1, 0)
     state.good_samples += 1
     state.measured_position_rad = sample.position_rad
     state.second_position_rad = sample.second_position_rad

@@ -20,6 +20,7 @@ import numpy as np
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_learning, right_column_of_p
 from jointctl.firmware_py.motion_records import (
+    SET_POINTS,
     ChangeAnswer,
     ChangeConstants,
     ChangeKind,
@@ -28,20 +29,13 @@ from jointctl.firmware_py.motion_records import (
     Gains,
     MotionChange,
     Reference,
-    TrajectoryConstants,
-)
-from jointctl.firmware_py.observers import set_kalman_gains
-from jointctl.firmware_py.records import (
-    SET_POINTS,
-    AxisConstants,
-    AxisState,
-    LawConstants,
-    LawState,
-    LimitConstants,
     SetPoint,
     StreamConstants,
     StreamState,
+    TrajectoryConstants,
 )
+from jointctl.firmware_py.observers import set_kalman_gains
+from jointctl.firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants
 from jointctl.firmware_py.safety import set_point_problem, within
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, SetPointProblem, TrajectoryKind
 from jointctl.firmware_py.trajectory import (

@@ -130,3 +130,49 @@ class ChangeState:
     goal: Reference  # of the new motion at its start, at rest
     move_s: f8  # that the way there takes, at least until it begins
     next_trajectory: TrajectoryConstants
+
+
+# --- Set-points that come while the joint moves: see `live_change` ---
+
+SET_POINTS = 256  # on their way from a program to the loop
+
+
+@record
+class SetPoint:
+    time_ns: i8  # CLOCK_MONOTONIC; the joint is to be there `StreamConstants.delay_ns` later
+    position_rad: f8
+    velocity_radps: f8
+    acceleration_radps2: f8  # NaN: that between the velocities of two set-points
+    torque_Nm: f8  # on top of the law's
+
+
+@record
+class StreamConstants:
+    """Limits of set-points, and the ring that they come through: `written` is counted up behind each of them.
+
+    The limits never change after the start; ring, `written` and `alive_ns` belong to the program outside.
+    """
+
+    delay_ns: i8
+    timeout_ns: i8  # between two set-points
+    client_timeout_ns: i8  # of the program's sign of life; 0 = none is expected
+    acceleration_max_radps2: f8
+    jump_max_rad: f8
+    torque_max_Nm: f8
+    torque_rate_max_Nmps: f8
+    written: Annotated[np.ndarray, array_of(i8, 1)]  # set-points since the start
+    alive_ns: Annotated[np.ndarray, array_of(i8, 1)]  # CLOCK_MONOTONIC of the newest sign of life
+    time_ns: Annotated[np.ndarray, array_of(i8, SET_POINTS)]
+    values: Annotated[np.ndarray, array_of(f8, SET_POINTS, 4)]  # position, velocity, acceleration, torque
+
+
+@record
+class StreamState:
+    written: i8  # set-points that have come for all joints since the start
+    taken: i8  # set-points taken out of the ring
+    refused: i8  # of them those that the loop did not follow
+    following: i4  # 1 between two set-points, 0 at rest or braking
+    before: SetPoint
+    after: SetPoint
+    coming: SetPoint  # on its way from the ring
+    torque_Nm: f8  # on top of the law's, in this cycle

@@ -8,7 +8,14 @@ from typing import Annotated
 
 import numpy as np
 
-from jointctl.firmware_py.motion_records import ChangeConstants, ChangeState, Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import (
+    ChangeConstants,
+    ChangeState,
+    Reference,
+    StreamConstants,
+    StreamState,
+    TrajectoryConstants,
+)
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- Friction: the model and what it depends on, its bristles, and what adapts (`friction`) ---
@@ -32,8 +39,10 @@ class HarmonicSeries:
 
 @record
 class FrictionBranch:
-    """One direction of the multi-stage model (11), mirrored to positive speed and friction: speeds of the joint
-    [rad/s], torques at the motor [Nm]."""
+    """One direction of the multi-stage model (11), mirrored to positive speed and friction.
+
+    Speeds are those of the joint [rad/s], torques those at the motor [Nm].
+    """
 
     coulomb_Nm: f8
     static_Nm: f8
@@ -316,51 +325,6 @@ class LawState:
     network_torque_Nm: f8  # fhat, which is subtracted
     observer_torque_Nm: f8
     learned_torque_Nm: f8
-
-
-# --- Set-points that come while the joint moves: see `stream` ---
-
-
-SET_POINTS = 256  # on their way from a program to the loop
-
-
-@record
-class SetPoint:
-    time_ns: i8  # CLOCK_MONOTONIC; the joint is to be there `StreamConstants.delay_ns` later
-    position_rad: f8
-    velocity_radps: f8
-    acceleration_radps2: f8  # NaN: that between the velocities of two set-points
-    torque_Nm: f8  # on top of the law's
-
-
-@record
-class StreamConstants:
-    """Limits of set-points, and the ring that they come through: `written` is counted up behind each of them; the
-    limits never change after the start; ring, `written` and `alive_ns` belong to the program outside."""
-
-    delay_ns: i8
-    timeout_ns: i8  # between two set-points
-    client_timeout_ns: i8  # of the program's sign of life; 0 = none is expected
-    acceleration_max_radps2: f8
-    jump_max_rad: f8
-    torque_max_Nm: f8
-    torque_rate_max_Nmps: f8
-    written: Annotated[np.ndarray, array_of(i8, 1)]  # set-points since the start
-    alive_ns: Annotated[np.ndarray, array_of(i8, 1)]  # CLOCK_MONOTONIC of the newest sign of life
-    time_ns: Annotated[np.ndarray, array_of(i8, SET_POINTS)]
-    values: Annotated[np.ndarray, array_of(f8, SET_POINTS, 4)]  # position, velocity, acceleration, torque
-
-
-@record
-class StreamState:
-    written: i8  # set-points that have come for all joints since the start
-    taken: i8  # set-points taken out of the ring
-    refused: i8  # of them those that the loop did not follow
-    following: i4  # 1 between two set-points, 0 at rest or braking
-    before: SetPoint
-    after: SetPoint
-    coming: SetPoint  # on its way from the ring
-    torque_Nm: f8  # on top of the law's, in this cycle
 
 
 # --- One joint: limits, phases, samples, commands ---

@@ -10,14 +10,13 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import load_acquire
+from jointctl.firmware_py.motion_records import SetPoint, StreamConstants
 from jointctl.firmware_py.observers import REST_STEPS, allow_reversal, note_rest, step_hunting, step_swing, torque_noise
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
     LimitConstants,
     Sample,
-    SetPoint,
-    StreamConstants,
     SwingState,
 )
 from jointctl.firmware_py.states import (
@@ -30,7 +29,7 @@ from jointctl.firmware_py.states import (
     Reaction,
     SetPointProblem,
 )
-from jointctl.firmware_py.trajectory import cubic
+from jointctl.firmware_py.trajectory import cubic, extremes_s
 
 # Half swings in a row that are a limit cycle; on 480 runs of healthy joints 2 at most of either kind, and 6 that grew.
 TORQUE_SWINGS = 4
@@ -192,6 +191,12 @@ def client_silent_s(constants: StreamConstants, now_ns: int) -> float:
 
 
 @kernel
+def tallied(lost: int, more_lost: int) -> int:
+    """Cycles that were lost, less those that were not: where most are lost it grows, and the delay with it."""
+    return lost + more_lost if more_lost > 0 else max(lost - 1, 0)
+
+
+@kernel
 def check_supervision(
     constants: AxisConstants, state: AxisState, sample: Sample, skipped_cycles: int, supervisor_age_cycles: int
 ) -> None:
@@ -201,10 +206,12 @@ def check_supervision(
     _check_drive(state, sample)
     limits, sequence = constants.limits, constants.sequence
     if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
-        missing = max(state.sample_age_cycles, state.missing_samples)  # of most: a delay that no margin allows for
+        lost_cycles = 0 if state.sample_age_cycles == 0 else 1 + skipped_cycles
+        state.missing_samples = tallied(state.missing_samples, lost_cycles)
+        missing = max(state.sample_age_cycles, state.missing_samples)
         if missing > limits.sample_age_max_cycles:
             trip(state, Fault.STALE_SAMPLE, float(missing), sample.drive_error)
-        state.unsent_cycles = max(state.unsent_cycles + (1 if sample.bus_errors > 0 else -1), 0)
+        state.unsent_cycles = tallied(state.unsent_cycles, int(sample.bus_errors > 0))
         unsent = max(sample.bus_errors, state.unsent_cycles)
         if unsent > limits.sample_age_max_cycles:
             trip(state, Fault.BUS_ERROR, float(unsent), 0)
@@ -220,7 +227,7 @@ def check_supervision(
     if state.phase == AxisPhase.WAITING and sequence.supervisor_max_cycles > 0:
         if supervisor_age_cycles > sequence.wait_max_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
-    state.missed_slots = max(state.missed_slots - 1, 0) + skipped_cycles
+    state.missed_slots = tallied(state.missed_slots, 0) + skipped_cycles
     if powered(state.phase) and state.missed_slots > limits.skipped_max_cycles:
         trip(state, Fault.OVERRUN, float(state.missed_slots), 0)
 
@@ -304,18 +311,7 @@ def set_point_problem(
     steep = steep or not abs(after.velocity_radps - before.velocity_radps) <= room_radps
     if steep or not abs(off_rad) <= 0.5 * room_radps * duration_s:
         return SetPointProblem.ACCELERATION
-    # where its velocity is greatest, and where it turns back: roots of v0 + 2 c2 d + 3 c3 d^2, the nearer one without
-    # a difference of large numbers
-    quickest_s = turn_s = other_turn_s = duration_s
-    if c3 != 0.0:
-        quickest_s = -c2 / (3.0 * c3)
-    under_root = c2 * c2 - 3.0 * c3 * before.velocity_radps
-    if under_root >= 0.0:
-        larger = -(c2 + math.copysign(math.sqrt(under_root), c2))
-        if larger != 0.0:
-            turn_s = before.velocity_radps / larger
-        if c3 != 0.0:
-            other_turn_s = larger / (3.0 * c3)
+    quickest_s, turn_s, other_turn_s = extremes_s(before.velocity_radps, c2, c3, duration_s)
     for d in (0.25 * duration_s, 0.5 * duration_s, 0.75 * duration_s, duration_s, quickest_s, turn_s, other_turn_s):
         if not 0.0 < d <= duration_s:
             continue
@@ -505,9 +501,13 @@ def watch_rest(constants: AxisConstants, state: AxisState, sample: Sample) -> No
 
 @kernel
 def swing_fault(
-    limits: LimitConstants, state: SwingState, torque_Nm: float, error_rad: float, reference_velocity_radps: float,
+    limits: LimitConstants,
+    state: SwingState,
+    torque_Nm: float,
+    error_rad: float,
+    reference_velocity_radps: float,
     cycle: int,
-) -> Fault:  # fmt: skip
+) -> Fault:
     """LIMIT_CYCLE if the torque reverses between shares of its limits, or an oscillation of the error stays or grows.
 
     `torque_Nm` is the command without what the desired acceleration asks for.  The error is compared with its limit, or

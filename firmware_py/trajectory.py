@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel, plain
-from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
-from jointctl.firmware_py.records import SetPoint
+from jointctl.firmware_py.motion_records import Reference, SetPoint, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 
@@ -307,6 +306,25 @@ def cubic(before: SetPoint, after: SetPoint) -> tuple[float, float, float]:
     rate = (after.position_rad - before.position_rad) / duration_s
     v0, v1 = before.velocity_radps, after.velocity_radps
     return duration_s, (3.0 * rate - 2.0 * v0 - v1) / duration_s, (v0 + v1 - 2.0 * rate) / (duration_s * duration_s)
+
+
+@kernel
+def extremes_s(v0: float, c2: float, c3: float, duration_s: float) -> tuple[float, float, float]:
+    """Times of that cubic: (its velocity is greatest, it turns back, it turns back); `duration_s` where it does not.
+
+    The latter are the roots of v0 + 2 c2 d + 3 c3 d^2, the nearer one without a difference of large numbers.
+    """
+    quickest_s = turn_s = other_turn_s = duration_s
+    if c3 != 0.0:
+        quickest_s = -c2 / (3.0 * c3)
+    under_root = c2 * c2 - 3.0 * c3 * v0
+    if under_root >= 0.0:
+        larger = -(c2 + math.copysign(math.sqrt(under_root), c2))
+        if larger != 0.0:
+            turn_s = v0 / larger
+        if c3 != 0.0:
+            other_turn_s = larger / (3.0 * c3)
+    return quickest_s, turn_s, other_turn_s
 
 
 @kernel

@@ -21,7 +21,8 @@ import numpy as np
 from jointctl.firmware_py.cycle import Clock, CycleMemory, Exchange, Slot, Word, step_cycle
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.libc import load_acquire, store_release
-from jointctl.firmware_py.records import SET_POINTS, AxisState, Sample, StreamConstants
+from jointctl.firmware_py.motion_records import SET_POINTS, StreamConstants
+from jointctl.firmware_py.records import AxisState, Sample
 from jointctl.firmware_py.states import StopRequest
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together

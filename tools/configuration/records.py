@@ -13,7 +13,7 @@ from jointctl.firmware_py.flexible_joint import SEEN_Hz
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.motion_records import ChangeConstants, Gains, TrajectoryConstants
+from jointctl.firmware_py.motion_records import ChangeConstants, Gains, StreamConstants, TrajectoryConstants
 from jointctl.firmware_py.observers import low_pass_gain, set_kalman_gains
 from jointctl.firmware_py.records import (
     FED_HISTORY,
@@ -24,7 +24,6 @@ from jointctl.firmware_py.records import (
     LawConstants,
     LimitConstants,
     SequenceConstants,
-    StreamConstants,
     SwingConstants,
     VelocityConstants,
 )

@@ -19,8 +19,8 @@ import numpy as np
 from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.live_change import CLOSE_SHARE
-from jointctl.firmware_py.motion_records import MotionChange
-from jointctl.firmware_py.records import AxisConstants, SetPoint
+from jointctl.firmware_py.motion_records import MotionChange, SetPoint
+from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKind, in_words

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from jointctl.firmware_py.live_change import between, step_other_motion
-from jointctl.firmware_py.motion_records import ChangeKind, Reference
-from jointctl.firmware_py.records import SET_POINTS, SetPoint
+from jointctl.firmware_py.motion_records import SET_POINTS, ChangeKind, Reference, SetPoint
 from jointctl.firmware_py.safety import reference_fault, set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
