@@ -36,6 +36,8 @@ from jointctl.tools.analysis.linear_loop import (
     LoopSettings,
     StateSpace,
     TwoMasses,
+    closed_loop,
+    come_to_rest,
     linear_loop,
     loop_settings,
     poles_of,
@@ -393,10 +395,10 @@ class _Search:
         self._responses = np.array([joint.response(self._z) for joint in joints])
         plants = [joint.state_space() for joint in joints]
         sizes = [len(plant.a) for plant in plants]  # by their delay
-        self._alike = [np.flatnonzero(np.equal(sizes, size)) for size in sorted(set(sizes))]
+        self._believed = plants[0]
         self._plants = [
-            StateSpace(*(np.array([getattr(plants[i], name) for i in alike]) for name in "abcd"))
-            for alike in self._alike
+            StateSpace(*(np.array([getattr(plants[i], name) for i in np.flatnonzero(alike)]) for name in "abcd"))
+            for alike in (np.equal(sizes, size) for size in sorted(set(sizes)))
         ]
         counts = [law_resolution_rad(config), abs(joint_rad_per_count(config))]
         two = self.nominal.encoders == Encoders.BOTH
@@ -410,17 +412,15 @@ class _Search:
 
     def _judge(self, settings: LoopSettings) -> Judged:
         controller = linear_loop(settings).controller
-        radii = np.empty(len(self._responses))
-        for alike, plants in zip(self._alike, self._plants, strict=True):
-            radii[alike] = np.max(np.abs(poles_of(plants, controller)), axis=-1)
-        if np.max(radii) >= 1.0:
-            worst = float(np.max(radii))
-            return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
+        loops = [closed_loop(plants, controller) for plants in self._plants]
+        if not all(come_to_rest(alike) for alike in loops):
+            worst = max(float(np.max(np.abs(poles_of(alike)))) for alike in loops)
+            if worst >= 1.0:
+                return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
         law = controller.response(self._z)
         phases, gains, peaks = margins_on_grid(-(law @ self._responses)[:, :, 0, 0])
         phases, peaks = phases * self._eased, peaks / self._eased
-        own = slice(self._of_goals)
-        gate = slice(self._of_goals, None)
+        own, gate = slice(self._of_goals), slice(self._of_goals, None)
         response = self._responses[0]
         sensitivity = 1.0 / (1.0 - (law @ response)[:, 0, 0])
         error = self._link * sensitivity * np.hypot(1.0 / self._omega, 1.0 / self.law.ripple_radps)
@@ -430,7 +430,7 @@ class _Search:
             float(np.min(phases[own])), float(np.min(gains[own])), float(np.max(peaks[own])),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
             float(np.min(phases[gate], initial=90.0)), float(np.max(peaks[gate], initial=1.0)),
-            -settings.period_s / math.log(radii[0]),
+            -settings.period_s / math.log(np.max(np.abs(poles_of(closed_loop(self._believed, controller))))),
         )  # fmt: skip
 
 
