@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,16 @@ from tests.tiers import FOLDERS, LOCKSTEP, tier_of
 def test_what_the_tiers_name_exists() -> None:
     assert [name for name in FOLDERS if not (ROOT / "tests" / name).is_dir()] == []
     assert [name for name in LOCKSTEP if not (ROOT / "tests" / name).is_file()] == []
+
+
+def test_the_script_collects_all_that_needs_real_time() -> None:
+    collected = re.search(r"IN_REAL_TIME=\((.+)\)", (ROOT / "check").read_text())
+    assert collected is not None
+    needed = {f"tests/{name}" for name in FOLDERS}
+    for file in (ROOT / "tests").rglob("test_*.py"):
+        if file.relative_to(ROOT / "tests").parts[0] not in FOLDERS and "@pytest.mark.realtime" in file.read_text():
+            needed.add(str(file.relative_to(ROOT)))
+    assert needed - {str(Path(__file__).relative_to(ROOT))} == set(collected[1].split())
 
 
 @pytest.mark.parametrize(
