@@ -40,6 +40,7 @@ class Tab:
         request = urllib.request.Request(f"http://127.0.0.1:{browser.port}/json/new?{url}", method="PUT")
         with urllib.request.urlopen(request, timeout=20) as answer:
             target = json.load(answer)
+        self._id, self._port = target["id"], browser.port
         self._stack = contextlib.ExitStack()
         way = connect(target["webSocketDebuggerUrl"], max_size=1 << 26, open_timeout=20)
         self._socket = self._stack.enter_context(way)
@@ -116,6 +117,7 @@ class Tab:
     def close(self) -> None:
         with contextlib.suppress(Exception):  # the browser may have been killed
             self._stack.close()
+            urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json/close/{self._id}", timeout=20).close()
 
 
 class Browser:
@@ -150,13 +152,15 @@ class Browser:
         )  # fmt: skip
         return tab
 
+    def close_tabs(self) -> None:
+        while self.tabs:
+            self.tabs.pop().close()
+
     def __enter__(self) -> Browser:
         return self
 
     def __exit__(self, *_: object) -> None:
-
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
-        for tab in self.tabs:
-            tab.close()
+        self.close_tabs()

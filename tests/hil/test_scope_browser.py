@@ -42,8 +42,22 @@ SEEN = f"""(() => {{
 }})()"""
 
 
+@pytest.fixture(scope="module")
+def shared_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
+
+
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
+def browser(shared_browser: Browser) -> Iterator[Browser]:
+    """To start one takes more time than most pages need: each test has tabs of its own."""
+    yield shared_browser
+    shared_browser.close_tabs()
+
+
+@pytest.fixture
+def own_browser(tmp_path: Path) -> Iterator[Browser]:
+    """For a test that stops it."""
     with Browser(tmp_path) as browser:
         yield browser
 
@@ -192,18 +206,18 @@ def panel(tab: Tab) -> str:
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, browser: Browser, moving: bool) -> None:
-    scope, tab, _ = opened(bench, browser)
+def test_stop_from_a_second_terminal_ends_the_page_in_words(bench: Any, own_browser: Browser, moving: bool) -> None:
+    scope, tab, _ = opened(bench, own_browser)
     if moving:
         start(tab)
         moves(tab)
     else:
-        os.killpg(browser.process.pid, signal.SIGSTOP)  # a computer too busy to show anything
+        os.killpg(own_browser.process.pid, signal.SIGSTOP)  # a computer too busy to show anything
     stopped = bench.run("stop", "joint.toml")
     assert (stopped.code, stopped.out) == (0, "the drive is switch on disabled\n"), stopped
     if not moving:
         time.sleep(5.0)
-        os.killpg(browser.process.pid, signal.SIGCONT)
+        os.killpg(own_browser.process.pid, signal.SIGCONT)
     assert scope.finished(40.0).code == 130
     assert bench.disabled()
     state_is(tab, "jointctl has ended")
@@ -525,16 +539,16 @@ def downloaded(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: Browser) -> None:
-    scope, tab, _ = opened(bench, browser)
+def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, own_browser: Browser) -> None:
+    scope, tab, _ = opened(bench, own_browser)
     start(tab)
     moves(tab)
     server = scope.child("jointctl.tools.scoping.server")
     before_kB, before_supervisor_kB = resident_kB(server), resident_kB(scope.process.pid)
-    os.killpg(browser.process.pid, signal.SIGSTOP)
+    os.killpg(own_browser.process.pid, signal.SIGSTOP)
     time.sleep(15.0)
     stalled_kB, stalled_supervisor_kB = resident_kB(server), resident_kB(scope.process.pid)
-    os.killpg(browser.process.pid, signal.SIGKILL)
+    os.killpg(own_browser.process.pid, signal.SIGKILL)
     time.sleep(2.0)
     scope.signal(signal.SIGINT)
     assert scope.finished(30.0).code == 130
