@@ -18,7 +18,7 @@ from jointctl.tools.configuration.drive_section import require_torque
 from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.lockstep import LockstepArm, LockstepJoint
 from jointctl.tools.session.live_changes import post_change
-from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.session.session_drive import latched_text, session_drive
 
 STOP_S = 30.0  # of simulated time, for enabling or stopping
 
@@ -82,10 +82,8 @@ class LockstepMotor:
     def _require_tracking(self) -> None:
         joints = zip(self.axes.joints, self.axes.names, self.axis, strict=True)
         for config, name, axis in sorted(joints, key=lambda joint: int(joint[2].fault_slot_ns)):
-            fault = Fault(int(axis.fault))
-            if fault is not Fault.NONE:
-                text = self.drive.fault_text(config, fault, float(axis.fault_value), int(axis.fault_drive_error))
-                named = f"{name}: " if name else ""
+            if (text := latched_text(config, axis)) is not None:
+                fault, named = Fault(int(axis.fault)), f"{name}: " if name else ""
                 raise MotionFault(f"{named}{fault.name} ({int(fault)}): {text.happened}", text.advice)
         for phase in self._phases:
             if phase != AxisPhase.TRACKING:

@@ -57,7 +57,6 @@ from jointctl.tools.lockstep import LockstepJoint, LockstepRun  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
 from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402
 from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
-from jointctl.tools.tuning import carry_out  # noqa: E402
 from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
 from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402
 from jointctl.tools.tuning.joint_fit import SMALL_MOTION, Estimate, JointFit, values_of_fit  # noqa: E402
@@ -87,7 +86,7 @@ class Timed(Carrier):
                 runs.append(super().run_as_configured(*given, **options))
                 return runs[-1]
 
-        with patch.object(carry_out, "LockstepJoint", Watched), self.simulation():
+        with patch.object(sweeping, "LockstepJoint", Watched), self.simulation():
             carried = super().run(config, motion, *args, **how)
         self.seconds += len(carried.records) / config.loop.rate_Hz
         if isinstance(motion, ResponseMotion) and len(motion.plan.legs.starts) > 2 * STAGE_PAIRS:

@@ -146,9 +146,13 @@ def test_in_simulated_time_the_gate_and_a_dry_run_are_those_of_the_joint(tmp_pat
 
 def test_the_faults_of_the_virtual_joint_end_a_map_in_simulated_time(tmp_path: Path) -> None:
     faulty = load_config(
-        written(tmp_path / "faulty.toml", "realistic", virtual__faults=[{"kind": "drive_fault", "at_s": 3.0}])
+        written(
+            tmp_path / "faulty.toml",
+            "realistic",
+            virtual__faults=[{"kind": "drive_fault", "at_s": 3.0, "magnitude": 0x7300}],
+        )
     )
-    with pytest.raises(MotionFault, match=r"DRIVE_FAULT \(\d+\): the drive reported a fault .*; no map") as fault:
+    with pytest.raises(MotionFault, match=r"DRIVE_FAULT \(\d+\): .*'s error code is 7300h, .*; no map") as fault:
         map_verb(faulty, Output(stdout=io.StringIO(), stderr=io.StringIO()), options=IN_LOCKSTEP)
     assert "likely cause: " in (fault.value.hint or "")
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from jointctl.drivers.drive import Drive, DriveGroup
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import AxisState
 from jointctl.firmware_py.states import DriveState, Fault, in_words
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -132,3 +133,13 @@ _DRIVES: dict[str, Callable[[], SessionDrive]] = {"canopen": _canopen, "elmo_ser
 def session_drive(kind: str) -> SessionDrive:
     """For drive.kind; only that drive's modules are loaded."""
     return _DRIVES[kind]()
+
+
+def latched_text(config: Config, state: AxisState) -> FaultText | None:
+    """The fault that a loop has latched in the words of a session; None where there is none."""
+    if state.fault == Fault.NONE:
+        return None
+    errors = int(state.fault_drive_error), int(state.fault_encoder_error)
+    return session_drive(config.drive.kind).fault_text(
+        config, Fault(int(state.fault)), float(state.fault_value), *errors
+    )

@@ -30,10 +30,11 @@ from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.display import OnlyShows, Snapshot, run_display
-from jointctl.tools.session.fault_words import FaultText, fault_text
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
 from jointctl.tools.session.session import Session
+from jointctl.tools.session.session_drive import latched_text
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import (
     BATCHES,
@@ -469,9 +470,7 @@ def simulated_run(
         return None
     joint, placed = begun
     run = joint.run_as_configured(placed.constants, placed.table)
-    if run.fault:
-        two_encoders = config.joint_encoder is not None
-        text = fault_text(run.fault, float(run.state.fault_value), 0, two_encoders=two_encoders)
+    if (text := latched_text(config, run.state)) is not None:
         raise _ended(run.fault, text, what)
     return joint, run
 
@@ -495,8 +494,8 @@ def simulated(
 
 def sweep_in_lockstep(
     swept: SweepPass, meter: SweepMeter, consent: Consent, begin: Begin, *, allow_low_margin: bool = False
-) -> tuple[Fault, float] | None:
-    """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
+) -> tuple[Fault, FaultText | None] | None:
+    """The whole motion on the virtual joint in simulated time; the fault, in words too; None after a dry run."""
     config = swept.config
     begun = simulated(config, swept, consent, allow_low_margin=allow_low_margin)
     if begun is None:
@@ -508,4 +507,4 @@ def sweep_in_lockstep(
     if run.thermometer:
         meter.warmth = run.log.trajectory_s[run.tracking], run.truth[run.tracking, TRUE_WARMTH_degC]
     meter.feed(run.log)
-    return run.fault, float(run.state.fault_value)
+    return run.fault, latched_text(config, run.state)

@@ -18,28 +18,29 @@ import numpy as np
 from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.gains import Intervals, latest_s
 from jointctl.tools.analysis.linear_loop import loop_settings
-from jointctl.tools.analysis.margin_gate import meets, passes, require_margin
+from jointctl.tools.analysis.margin_gate import meets, passes
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import static_friction_Nm
 from jointctl.tools.configuration.found_values import Found, rounded, with_sliding, with_values
 from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
 from jointctl.tools.configuration.sections import MinJerk, Trajectory
-from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import run_display
-from jointctl.tools.session.fault_words import FaultText, fault_text
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
+from jointctl.tools.session.session_drive import latched_text
+from jointctl.tools.sweeping.carry_out import simulated
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
     LEAST_SHARE,
@@ -130,20 +131,14 @@ class Carrier:
         return carried
 
     def _simulated(self, config: Config, motion: Motion) -> Carried:
-        if not config.drive.simulated or config.drive.kind != "canopen":
-            raise UsageError('--lockstep is for the virtual joint with drive.kind = "canopen"')
-        require_margin(config, allow_low_margin=self.allow_low_margin)
-        joint = LockstepJoint(config)
-        placed = motion.placed(joint.report)
-        if self.consent.dry_run:
-            self.consent.show(placed.lines)
+        consent = self.consent if self.consent.dry_run else TerminalConsent(self.quietly(), assume_yes=True)
+        begun = simulated(config, motion, consent, allow_low_margin=self.allow_low_margin)
+        if begun is None:
             raise NotCarriedOut("")
-        motion.require_start(joint.report.start_position_rad)
+        joint, placed = begun
         run = joint.run_as_configured(placed.constants, placed.table)
-        self.drive_state = PowerState(int(run.device.state)).name.lower().replace("_", " ")
-        value = float(run.state.fault_value)
-        text = fault_text(run.fault, value, 0) if run.fault is not Fault.NONE else None
-        return Carried(run.log, run.fault, text, "", value)
+        self.drive_state = in_words(PowerState(int(run.device.state)))
+        return Carried(run.log, run.fault, latched_text(config, run.state), "", float(run.state.fault_value))
 
     def _moved(self, config: Config, motion: Motion, title: str) -> Carried:
         assert self.control is not None

@@ -162,10 +162,8 @@ class Sweep:
 
     def _measure(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float) -> str | None:
         """Visit the points; the name of the signal that stopped it or "", None if it was declined or a dry run."""
-        from jointctl.firmware_py.states import Fault
         from jointctl.tools.configuration.conversions import torque_constant_NmpA
         from jointctl.tools.session.display import Displays, PhaseLines
-        from jointctl.tools.session.fault_words import fault_text
         from jointctl.tools.session.session import Session
         from jointctl.tools.sweeping.carry_out import (
             MeterDisplay,
@@ -198,8 +196,7 @@ class Sweep:
             ended = sweep_in_lockstep(swept, meter, self._consent, begin, allow_low_margin=options.allow_low_margin)
             if ended is None:
                 return None
-            fault, value = ended
-            self._raise_fault(fault, fault_text(fault, value, 0) if fault is not Fault.NONE else None)
+            self._raise_fault(*ended)
             return ""
 
         def display(report: CommissioningReport) -> Display:

@@ -41,7 +41,7 @@ from jointctl.tools.session.fault_words import (
 )
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.run_watch import RunWatch
-from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.session.session_drive import latched_text, session_drive
 from jointctl.tools.sweeping import carry_out
 from jointctl.tools.verbs import scope as scope_module
 from jointctl.tools.verbs.doctor import doctor_motion
@@ -115,6 +115,22 @@ def test_a_missing_sample_of_two_encoders_may_be_that_of_either(fault: Fault) ->
         assert "encoder" in two.happened
         assert "the joint's encoder" in two.cause
         assert "not believed" in fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).cause
+
+
+@pytest.mark.parametrize(("code", "words"), [(0, ""), (0x7300, "; the drive's error code is 7300h, feedback sensor")])
+def test_what_a_loop_has_latched_is_told_with_the_errors_of_drive_and_encoder(code: int, words: str) -> None:
+    """In simulated time they were left out."""
+    state = new(AxisState)[0]
+    assert latched_text(CONFIG, state) is None
+    state.fault, state.fault_value, state.fault_drive_error = Fault.STALE_SAMPLE, 6.0, code
+    text = latched_text(CONFIG, state)
+    assert text is not None
+    assert text.happened == f"no position came for 6 cycles, at once or again and again{words}"
+    state.fault_encoder_error = 0x5000
+    text = latched_text(load_config(shipped_config("realistic")), state)
+    assert text is not None
+    assert "both encoders" in text.happened
+    assert "the encoder node's error code is 5000h" in text.happened
 
 
 @pytest.mark.parametrize(("status", "words"), [(0x8110, "stayed away"), (0x8100, "switched off without being asked")])
