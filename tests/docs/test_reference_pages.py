@@ -8,7 +8,7 @@ from docs.reference import UNITS
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Notice
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Notice
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.identification.friction_data import SWEEP_COLUMNS
 from jointctl.tools.recording.ros_messages import (
@@ -47,9 +47,7 @@ def test_every_section_and_column_is_named() -> None:
 
 # --- Run logs: tables and messages name the same ---
 TOPICS = [RECORD_TOPIC, JOINT_STATE_TOPIC, EVENT_TOPIC, TEMPERATURE_TOPIC, CAN_TOPIC]
-ENUMERATIONS = {
-    "phase": AxisPhase, "fault": Fault, "request": DriveRequest, "drive_state": DriveState, "notices": Notice,
-}  # fmt: skip
+ENUMERATIONS = {"phase": AxisPhase, "request": DriveRequest, "drive_state": DriveState, "notices": Notice}
 LOG_UNITS = UNITS | {"ns": "ns"}
 
 

@@ -39,5 +39,6 @@ def test_every_quoted_message_is_in_the_sources() -> None:
 
 def test_every_fault_is_there_in_the_words_of_the_program() -> None:
     for fault, text in FAULT_TEXTS.items():
-        row = f"| {fault.name} | `{re.sub('{[^}]*}', GAP, text.happened)}` | {text.cause} | {text.next_step} |"
+        happened = re.sub("{[^}]*}", GAP, text.happened)
+        row = f"| {fault.name} ({fault.value}) | `{happened}` | {text.cause} | {text.next_step} |"
         assert row in FAULTS

@@ -1,8 +1,8 @@
 """[drive]: what the section of every drive offers to the rest, and which class belongs to which `kind`.
 
-A drive is a plug-in of three parts, each behind a table of its kinds: its section here, what a session does with it
-(`tools.session.session_drive`), and what the verbs at the bench do with it (`tools.verbs.bench_drive`).  A new kind is
-one entry in each table; nothing else asks which drive it is.
+A drive is a plug-in of four parts, each behind a table of its kinds: its section here, what a session does with it
+(`tools.session.session_drive`), its loop (`tools.session.loops`), and what the verbs at the bench do with it
+(`tools.verbs.bench_drive`).  A new kind is one entry in each table; nothing else asks which drive it is.
 """
 
 from __future__ import annotations

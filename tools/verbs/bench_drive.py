@@ -1,4 +1,4 @@
-"""What the verbs at the bench do with a drive, whatever its kind: the third part of a drive's plug-in.
+"""What the verbs at the bench do with a drive, whatever its kind: the last part of a drive's plug-in.
 
 The first is its section (`tools.configuration.drive_section`), the second what a session does with it
 (`tools.session.session_drive`).  The modules of a kind are loaded when one of its methods is called: `stop` is not to
