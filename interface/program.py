@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from numbers import Integral
@@ -443,9 +443,8 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
     Also where virtual drives are asked for and the configuration has none.
     """
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
-    from jointctl.tools.configuration.load import moved
     from jointctl.tools.verbs.demo import with_patience
-    from jointctl.tools.verbs.verb_options import arm_on_bus
+    from jointctl.tools.verbs.verb_options import each_joint, on_bus
 
     options = observers(wanted.foxglove, wanted.ros2, allow_remote=wanted.allow_remote)
     config, shipped = _loaded(given, kind)
@@ -461,11 +460,8 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
     if own and without:
         raise ConfigurationError(f"{without[0]}: has no [virtual] section, so there is no virtual joint to start")
     place = GivenPlace("jointctl", f"python-{os.getpid()}-{next(_NUMBERS)}") if own else GivenPlace(*wanted.place)
-    if isinstance(config, Config):
-        config = moved(config, place, {}) if own else moved(config, place)
-        return Source(with_patience(config) if own else config, own), options
-    arm = arm_on_bus(config, place)
-    return Source(replace(arm, joints=tuple(map(with_patience, arm.joints))) if own else arm, own), options
+    config = on_bus(config, place, {} if own else None)
+    return Source(each_joint(config, with_patience) if own else config, own), options
 
 
 def _loaded(given: str | Path | Config | ArmConfig, kind: str) -> tuple[Config | ArmConfig, bool]:

@@ -42,7 +42,7 @@ from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
-from jointctl.tools.verbs.verb_options import arm_on_bus
+from jointctl.tools.verbs.verb_options import on_bus
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.arms import long_arm
 from tests.bench.c_programs import NoCompilerError, exchange_program, link_doubles, setting_doubles
@@ -449,7 +449,7 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
 
 def arm_for_comparison(path: Path, channel: str) -> ArmConfig:
     """An arm with the law that the C source knows."""
-    arm = arm_on_bus(load_arm(path), GivenPlace("jointctl", channel))
+    arm = on_bus(load_arm(path), GivenPlace("jointctl", channel))
     joints = tuple(
         changed(
             joint, control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,

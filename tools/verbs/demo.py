@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
-from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations, each_joint, on_bus
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
 
 LONGEST_S = 86_400.0
@@ -33,44 +33,37 @@ def demo(
     output: VerbOutput,
 ) -> int:
     """Track a trajectory on the virtual joint, or with a virtual arm: no hardware, no set-up."""
-    if arm:
-        if config is not None:
-            raise UsageError(f"--config (={config}) is for one joint: --arm is the shipped arm")
-        return _demo_of_arm(duration_s, output)
     from jointctl.tools.child_process import own_virtual_joint
-    from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
-    from jointctl.tools.configuration.load import load_config, moved
+    from jointctl.tools.configuration.drive_section import GivenPlace
     from jointctl.tools.verbs.run import tracked
 
-    path = config_path(config or Path("virtual"))
+    if arm and config is not None:
+        raise UsageError(f"--config (={config}) is for one joint: --arm is the shipped arm")
+    given = _arm() if arm else _joint(config_path(config or Path("virtual")))
+    channel = f"demo-{os.getpid()}"
+    moving = on_bus(given, GivenPlace("jointctl", channel), {})
+    if duration_s is not None:
+        moving = each_joint(moving, partial(_with_duration, duration_s=duration_s))
+    output.note(f"starting the virtual {'arm' if arm else 'joint'}")
+    with own_virtual_joint(given.path, channel, output.note) as own:
+        return tracked(each_joint(moving, with_patience), output, assume_yes=True, own=own)
+
+
+def _arm() -> ArmConfig:
+    from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+
+    return load_arm(SHIPPED_ARM)
+
+
+def _joint(path: Path) -> Config:
+    from jointctl.tools.configuration.drive_section import require_simulated
+    from jointctl.tools.configuration.load import load_config
+
     joint = load_config(path)
     require_simulated(joint, "demo")
     if joint.virtual is None:
         raise ConfigurationError(f"{joint.path}: has no [virtual] section, so there is no virtual joint to move")
-    channel = f"demo-{os.getpid()}"
-    joint = moved(joint, GivenPlace("jointctl", channel), {})
-    if duration_s is not None:
-        joint = _with_duration(joint, duration_s)
-    joint = with_patience(joint)
-    output.note("starting the virtual joint")
-    with own_virtual_joint(path, channel, output.note) as own:
-        return tracked(joint, output, assume_yes=True, own=own)
-
-
-def _demo_of_arm(duration_s: float | None, output: Output) -> int:
-    from jointctl.tools.child_process import own_virtual_joint
-    from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
-    from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.verbs.run import tracked
-    from jointctl.tools.verbs.verb_options import arm_on_bus
-
-    channel = f"demo-{os.getpid()}"
-    arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
-    joints = arm.joints if duration_s is None else tuple(_with_duration(joint, duration_s) for joint in arm.joints)
-    arm = replace(arm, joints=tuple(with_patience(joint) for joint in joints))
-    output.note("starting the virtual arm")
-    with own_virtual_joint(SHIPPED_ARM, channel, output.note) as own:
-        return tracked(arm, output, assume_yes=True, own=own)
+    return joint
 
 
 def with_patience(config: Config) -> Config:

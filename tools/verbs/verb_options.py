@@ -13,7 +13,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial, wraps
@@ -142,30 +142,39 @@ def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
 
 def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config | ArmConfig:
     """As `loaded`; of an arm's file the arm, all joints on the bus that is named."""
-    from jointctl.tools.configuration.arm import ArmConfig, load_joint_or_arm
-    from jointctl.tools.configuration.load import moved
+    from jointctl.tools.configuration.arm import load_joint_or_arm
 
     found = load_joint_or_arm(config_path(config))
     for remark in found.remarks:
         Output().warning(f"{found.path}: {remark}")
-    return arm_on_bus(found, place(bus)) if isinstance(found, ArmConfig) else moved(found, place(bus))
+    return on_bus(found, place(bus))
 
 
-def arm_on_bus(arm: ArmConfig, given: GivenPlace) -> ArmConfig:
-    """The arm with its joints where the command line says, see `GivenPlace.of_bus`.
+def each_joint(given: Config | ArmConfig, changed: Callable[[Config], Config]) -> Config | ArmConfig:
+    """A joint, or an arm of joints, that were changed."""
+    from jointctl.tools.configuration.config import Config
+
+    return changed(given) if isinstance(given, Config) else replace(given, joints=tuple(map(changed, given.joints)))
+
+
+def on_bus(arm: Config | ArmConfig, given: GivenPlace, environ: Mapping[str, str] | None = None) -> Config | ArmConfig:
+    """See `moved`; of an arm each of its joints is where the command line says, see `GivenPlace.of_bus`.
 
     `UsageError` for what is one joint's alone, and for one channel where there are several buses that are not virtual.
     """
-    from jointctl.tools.configuration.arm import bus_problems
-    from jointctl.tools.configuration.config import first_on_bus, raise_if
+    from jointctl.tools.configuration.config import Config, first_on_bus, raise_if
     from jointctl.tools.configuration.load import moved
+
+    if isinstance(arm, Config):
+        return moved(arm, given, environ)
+    from jointctl.tools.configuration.arm import bus_problems
 
     if given.node is not None:
         raise UsageError(f"--target (={given.node}) is one joint's, and {arm.path} is an arm", "give the joint's file")
     buses = first_on_bus(arm.joints)
     numbers = sorted(set(buses))
     joints = tuple(
-        moved(joint, given.of_bus(numbers.index(bus))) for joint, bus in zip(arm.joints, buses, strict=True)
+        moved(joint, given.of_bus(numbers.index(bus)), environ) for joint, bus in zip(arm.joints, buses, strict=True)
     )  # fmt: skip
     real = [joint.path for joint in joints if joint.bus.interface != "jointctl"]
     if given.channel is not None and len(numbers) > 1 and real:

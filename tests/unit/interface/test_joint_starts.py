@@ -19,7 +19,7 @@ from jointctl.drivers.stop_note import now_ns, write_note
 from jointctl.joint import Joint
 from jointctl.program import Wanted, axes_of, wanted_source
 from jointctl.tools.configuration.arm import SHIPPED_ARM
-from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.load import load_config, shipped_config
 from tests.configurations import written
 
 pytestmark = pytest.mark.usefixtures("old_program")
@@ -95,6 +95,18 @@ def test_so_it_is_of_an_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert source.config.path == tmp_path / "arm" / SHIPPED_ARM.name
     assert {joint.path.parent for joint in joints} == {tmp_path / "arm"}
     assert {joint.log.folder for joint in joints} == {str(tmp_path / "runs")}
+
+
+@pytest.mark.parametrize(("given", "kind"), [("virtual", "Joint"), ("arm", "Arm")])
+@pytest.mark.parametrize(("virtual", "bitrate_bitps"), [(True, 1_000_000), (False, 500_000)])
+def test_virtual_drives_of_ones_own_do_not_follow_the_environment(
+    monkeypatch: pytest.MonkeyPatch, given: str, kind: str, virtual: bool, bitrate_bitps: int
+) -> None:
+    """Those of an arm did, whose bus was then too slow for its joints."""
+    monkeypatch.setenv("CAN_BITRATE", "500000")
+    path = {"arm": SHIPPED_ARM}.get(given, shipped_config("virtual"))
+    source, _ = wanted_source(path, kind, Wanted(place=("socketcan", "can0", None, None, None), virtual=virtual))
+    assert {joint.bus.bitrate_bitps for joint in axes_of(source.config).joints} == {bitrate_bitps}
 
 
 @pytest.mark.parametrize("by", ["", "jointctl stop"])

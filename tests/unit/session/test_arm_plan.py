@@ -37,7 +37,7 @@ from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.check import check_arm
-from jointctl.tools.verbs.verb_options import arm_on_bus
+from jointctl.tools.verbs.verb_options import on_bus
 from tests.configurations import changed
 from tests.sessions import output
 
@@ -160,7 +160,7 @@ def on_two_buses(tmp_path: Path) -> Path:
 
 def test_a_channel_that_is_given_is_that_of_the_first_virtual_bus(on_two_buses: Path) -> None:
     given = GivenPlace("jointctl", "mine")
-    arm = arm_on_bus(load_arm(on_two_buses), given)
+    arm = on_bus(load_arm(on_two_buses), given)
     assert [joint.bus.channel for joint in arm.joints] == ["mine", "mine", "mine.2"]
     targets, unread = stop_targets(on_two_buses, given)
     assert [target.place for target in targets.values()] == [
@@ -173,8 +173,8 @@ def test_a_channel_that_is_given_is_that_of_the_first_virtual_bus(on_two_buses: 
 
 def test_one_channel_is_refused_where_the_buses_are_real(on_two_buses: Path) -> None:
     with pytest.raises(UsageError, match=r"--channel \(=can0\) names one bus, and the joints of .* are on 2"):
-        arm_on_bus(load_arm(on_two_buses), GivenPlace("socketcan", "can0"))
-    arm = arm_on_bus(load_arm(on_two_buses), GivenPlace("socketcan"))
+        on_bus(load_arm(on_two_buses), GivenPlace("socketcan", "can0"))
+    arm = on_bus(load_arm(on_two_buses), GivenPlace("socketcan"))
     assert [(joint.bus.interface, joint.bus.channel) for joint in arm.joints][1:] == [
         ("socketcan", "virtual0"), ("socketcan", "virtual1"),
     ]  # fmt: skip
@@ -187,7 +187,7 @@ def test_two_buses_become_one_by_the_environment_only_with_different_nodes(
     with pytest.raises(
         ConfigurationError, match=r"wrist.toml: drive.node \(=1\) must differ from drive.node of shoulder"
     ):
-        arm_on_bus(load_arm(on_two_buses), GivenPlace())
+        on_bus(load_arm(on_two_buses), GivenPlace())
 
 
 @pytest.mark.parametrize("cycles", [0, 1, 7, RING_RECORDS // 3 - 1, RING_RECORDS // 3 + 5, RING_RECORDS])
