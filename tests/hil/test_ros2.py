@@ -141,6 +141,11 @@ def test_an_approval_that_is_stopped_enables_nothing(bench: Any) -> None:
         run.program.saw("waiting up to")
         eventually(lambda: reports, 20.0)  # who is to enable it sees that it waits
         assert [(found.name, found.message) for found in reports[0].status] == [("joint: joint", ros2_server.WAITING)]
+        for place in (f"{DOMAIN}/joint/enable/**", key(DOMAIN, "/joint/enable", TRIGGER)):  # it only looks around
+            (reply,) = client.session.get(place, timeout=5.0)
+            assert reply.ok is not None
+            assert ros2_server.NO_CALL.encode() in reply.ok.payload.to_bytes()
+        time.sleep(1.0)
         assert client.call("/joint/stop")[0]
     ended = run.program.finished(60.0)
     assert ended.code == 12, ended.err

@@ -156,6 +156,7 @@ DIAGNOSTICS_S = 1.0
 MOST_NODES = 4096  # that are remembered by name
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/msg/DiagnosticStatus
 WAITING = "approved at the terminal; the next call of ~/enable moves the joint"
+NO_CALL = "not taken: it is no call of this service by a ROS 2 node"
 NOT_WAITING = "nothing waits for it: it enables once, after the approval at the terminal"
 
 
@@ -200,7 +201,7 @@ class Ros2View:
         if not order.only_states:
             self._serve("stop", self._stop)
         if order.allow_remote:
-            self._serve("enable", self._enable)
+            self._serve("enable", self._enable, by_node=True)
             self._follow()
 
     # --- endpoints ---
@@ -227,13 +228,16 @@ class Ros2View:
 
         return put
 
-    def _serve(self, name: str, answer: Callable[[str], tuple[bool, str]]) -> None:
+    def _serve(self, name: str, answer: Callable[[str], tuple[bool, str]], *, by_node: bool = False) -> None:
+        """`by_node`: only a node's call counts, and no query for many keys, as of a tool that looks what is there."""
         endpoint = self._endpoint(SERVICE, f"/{self._order.joint}/{name}", TRIGGER)
         response = self._types.types[f"{TRIGGER}_Response"]
 
         def call(query: zenoh.Query) -> None:
             found = read_attachment(query.attachment.to_bytes()) if query.attachment is not None else None
-            success, message = answer(self._name_of(found))
+            success, message = False, NO_CALL
+            if not by_node or (found is not None and str(query.key_expr) == endpoint.key):
+                success, message = answer(self._name_of(found))
             body = self._types.serialize_cdr(response(success=success, message=message), f"{TRIGGER}_Response")
             given = attachment(*found) if found is not None else None
             query.reply(endpoint.key, bytes(body), attachment=given)
