@@ -19,6 +19,7 @@ import os
 import re
 import socket
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from inspect import Parameter, signature
@@ -30,6 +31,9 @@ import can
 from jointctl.drivers.can import socketcan, virtual_bus
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.port_users import keep_from_forks, users_text
+
+# its `recv` measures its time-out by the calendar: one that is set back by an hour would hold up who waits for so long
+vars(can.bus)["time"] = time.monotonic
 
 Option = str | int | float | bool
 RESERVED = frozenset(("interface", "channel", "bitrate", "can_filters", "ignore_config", "config_context", "context"))

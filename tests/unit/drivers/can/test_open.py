@@ -597,3 +597,9 @@ def test_an_interface_that_is_not_there_is_one_line(interface: str) -> None:
         open_python_can(interface, "/dev/null/0" if interface in ("slcan", "serial", "robotell") else "0", 500_000)
     gc.collect()  # what a library has left open
     assert "\n" not in raised.value.message
+
+
+def test_a_calendar_that_is_set_back_does_not_lengthen_a_time_out() -> None:
+    receive = can.BusABC.recv
+    assert "time" in receive.__code__.co_names
+    assert receive.__globals__["time"] is time.monotonic
