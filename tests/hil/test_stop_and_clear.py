@@ -37,6 +37,7 @@ def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
     ended = run.finished(20.0)
     assert ended.code == 130, ended.err
     assert "stopped by jointctl stop" in ended.err
+    assert "quick stop asked for by jointctl stop" in [event.text for event in bench.log().events]
     assert bench.disabled()
 
 

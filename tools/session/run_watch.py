@@ -376,12 +376,7 @@ class RunWatch:
         if request is not StopRequest.NONE:
             self.loop.request_stop(request)
         self.take_records()
-        if request is not self._asked:
-            self._asked = request
-            if not self.around.signals.name:
-                self._stopped_by_viewer = self.display.stop_reason()
-            text = f"{in_words(request)} asked for by {self.stopped_by}"
-            self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
+        self.tell_stop(request)
         self.guard_settings(may_ask=self.delay_s is not None)  # reads lengthen the delay that is measured
         self.check_delay()
         self._may_enable()
@@ -396,6 +391,16 @@ class RunWatch:
         if (phase := self.loop.phase) is not self._phase:
             self._phase = phase
             self.display.phase(phase_name(phase))
+
+    def tell_stop(self, request: StopRequest) -> None:
+        """That a stop was asked for, or for more; the loop may have ended before the next `poll`."""
+        if request <= self._asked:
+            return
+        self._asked = request
+        if not self.around.signals.name:
+            self._stopped_by_viewer = self.display.stop_reason()
+        text = f"{in_words(request)} asked for by {self.stopped_by}"
+        self._tell(Event(self.around.signals.commanded_ns or time.monotonic_ns(), WARNING, "supervisor", text))
 
     def guard_settings(self, *, may_ask: bool) -> None:
         """`DeviceError` or `BusError` where what stops the drive without us has been changed, or someone else commands.

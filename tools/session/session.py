@@ -306,6 +306,7 @@ class Session:
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         for each in watches:
             each.take_records(last=True)
+            each.tell_stop(signals.request)
         for each in watches:
             with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
