@@ -479,6 +479,7 @@ class AxisState:
     phase_cycle: i8  # cycles since the phase began
     held_up_cycles: i8  # of them those that the loop skipped in overruns beyond skipped_max_cycles
     ready: i4  # to go on to the next phase, as far as this axis is concerned
+    began: i4  # 1: the drive has left Switch On Disabled, or what it has instead, on its way to enabled
     held_back: i4  # by another axis that is not; set before the cycle, 0 for a single joint
     shaken: i4  # 1 while another axis is astray; set before the cycle, 0 for a single joint
     stood_rad: f8  # when its drive was enabled, from then on without torque, or when it came to rest after braking

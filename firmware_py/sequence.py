@@ -40,6 +40,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.held_up_cycles = 0
     state.good_samples = 0
     state.ready = 0
+    state.began = 0
     state.held_back = 0
     state.shaken = 0
     state.stood_rad = 0.0
@@ -158,8 +159,15 @@ def step_enabling(
 ) -> None:
     """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start.
 
-    A joint of an arm waits until `all_prepared`, then until `all_enabled`; one that never is ends the run of all.
+    A joint of an arm waits until `all_prepared`, then until `all_enabled`; one that never is ends the run of all.  So
+    does a drive that falls back to off: an STO that is closed again must not begin a motion.
     """
+    drive = sample.drive_state
+    if drive == DriveState.STARTING or drive == DriveState.PREPARED or drive == DriveState.ENABLED:
+        state.began = 1
+    elif drive == DriveState.OFF and state.began != 0:
+        trip(state, Fault.DRIVE_NOT_ENABLED, float(sample.status_word), sample.drive_error)
+        return
     if sample.drive_state != DriveState.ENABLED:
         state.stood_rad = state.measured_position_rad
     if moved_before_start(constants, state):  # a brake that has opened, say, whatever state the drive reports

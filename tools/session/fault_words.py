@@ -170,7 +170,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         follows_pause=True,
     ),
     Fault.DRIVE_NOT_ENABLED: FaultWords(
-        "the drive left Operation Enabled by itself (statusword {word})",
+        "the drive left Operation Enabled, or the way there, by itself (statusword {word})",
         "its enable input or STO was opened, a limit switch, or another master on the bus",
         "check the enable and STO wiring",
         follows_pause=True,

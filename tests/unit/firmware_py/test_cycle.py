@@ -65,6 +65,7 @@ class Arm:
         self.slow_to_enable = [0, 0]
         self.moving_rad = [0.0, 0.0]  # in each cycle
         self.silent = [False, False]
+        self.torque_off = [False, False]  # by its STO input
 
     def _receive(self, _: None, samples: Any, now_ns: int, until_ns: int) -> int:
         for axis, (sample, command) in enumerate(zip(samples, self.memory.command, strict=True)):
@@ -77,6 +78,10 @@ class Arm:
             self.slow_to_prepare[axis] -= prepare
             self.slow_to_enable[axis] -= enable
             sample.drive_state = DriveState.OFF
+            if self.torque_off[axis]:
+                continue
+            if prepare or enable:
+                sample.drive_state = DriveState.STARTING
             if (prepare or enable) and self.slow_to_prepare[axis] < 0:
                 sample.drive_state = DriveState.PREPARED
                 if enable and self.slow_to_enable[axis] < 0:
@@ -281,6 +286,24 @@ def test_a_drive_that_falls_back_before_all_are_enabled_takes_the_other_with_it(
     arm.slow_to_prepare[fell] = 1 << 30
     assert [int(request) for request in arm.run(1).memory.command.request] == [DriveRequest.PREPARE] * 2
     assert arm.run(1).memory.sample.drive_state[1 - fell] == DriveState.PREPARED
+
+
+@pytest.mark.parametrize("step", ["slow_to_prepare", "slow_to_enable"])
+@pytest.mark.parametrize("fell", [0, 1])
+def test_a_drive_that_falls_back_to_off_ends_the_start_of_all(fell: int, step: str) -> None:
+    """As by its STO input, which is closed again at once: that must not begin a motion."""
+    arm = Arm()
+    getattr(arm, step)[fell] = 1 << 30
+    while arm.memory.sample.drive_state[1 - fell] not in (DriveState.PREPARED, DriveState.ENABLED):
+        arm.run(1)
+    arm.torque_off[fell] = True
+    arm.run(1)
+    assert arm.faults == [Fault.DRIVE_NOT_ENABLED if axis == fell else Fault.NONE for axis in range(2)]
+    arm.torque_off[fell], getattr(arm, step)[fell] = False, 0
+    requests = set()
+    while arm.cycles < 20_000 and not arm.ended:
+        requests |= {int(request) for request in arm.run(1).memory.command.request}
+    assert (arm.ended, requests) == (True, {DriveRequest.OFF})
 
 
 @pytest.mark.parametrize("moving", [0, 1])

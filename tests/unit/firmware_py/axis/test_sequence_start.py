@@ -118,6 +118,25 @@ def test_nor_one_that_moves_while_its_drive_reports_that_it_is_not_enabled_yet(
     )
 
 
+@pytest.mark.parametrize("before", [DriveState.STARTING, DriveState.PREPARED, DriveState.ENABLED])
+def test_a_drive_that_falls_back_to_off_is_not_asked_again(axis: Any, state: Any, before: DriveState) -> None:
+    settled(state)
+    state.phase = AxisPhase.ENABLING
+    step_enabling(axis, state, sample_of(before), axis_table(), False, False)
+    step_enabling(axis, state, sample_of(DriveState.OFF), axis_table(), False, False)
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.DRIVE_NOT_ENABLED)
+    assert (state.fault_value, state.fault_drive_error) == (0x1237, 0x3310)
+
+
+@pytest.mark.parametrize("before", [DriveState.UNKNOWN, DriveState.OFF])
+def test_its_twin_that_has_not_begun_yet_is_waited_for(axis: Any, state: Any, before: DriveState) -> None:
+    settled(state)
+    state.phase = AxisPhase.ENABLING
+    for drive_state in (before, DriveState.OFF, DriveState.STARTING, DriveState.PREPARED, DriveState.STARTING):
+        step_enabling(axis, state, sample_of(drive_state), axis_table(), False, False)
+    assert (state.phase, state.fault) == (AxisPhase.ENABLING, Fault.NONE)
+
+
 @pytest.mark.trips(Fault.DRIVE_STAYS_ENABLED, "Fault.DRIVE_STAYS_ENABLED")
 @pytest.mark.stays(Fault.DRIVE_STAYS_ENABLED, "(AxisPhase.WAITING, Fault.NONE)")
 @pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.ENABLED])
