@@ -454,7 +454,7 @@ def _program(pid: int) -> str:
 
 
 LOOKS = 3  # at all buses, after their controllers have ended
-LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
+LONGEST_S = 300.0  # that a program may ask for: four time-outs of a stop are at most 60 s each
 TERM_S = 1.0  # between SIGTERM and SIGKILL
 KILL_S = 2.0
 POLL_S = 0.02

@@ -111,7 +111,7 @@ class CanopenDrive:
         self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
         self._objects.gate = gate
         self._switch_off = SwitchOff(
-            self._network, settings.node, self._objects, encoder, sleep, settings.stop_timeout_s
+            self._network, settings.node, self._objects, encoder, sleep, settings.stop_timeout_s, settings.off_timeout_s
         )
 
     def _pause(self, seconds: float) -> None:

@@ -90,6 +90,7 @@ class CanopenSettings:
     holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any
     stop_timeout_s: float = 0.0  # how long the drive may brake by itself until its power is taken
+    off_timeout_s: float = 0.0  # how long it may take then until it is off, its brake included
     brake_radps2: float = 0.0  # at the joint, of the loop's controlled stop; the drive's own is compared with it
     position_min_rad: float = -math.inf
     position_max_rad: float = math.inf

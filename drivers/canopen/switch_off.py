@@ -60,10 +60,13 @@ class SwitchOff:
 
     def __init__(
         self, network: canopen.Network, node: int, objects: ObjectAccess, encoder_node: int | None,
-        sleep: Callable[[float], None], braking_s: float = QUICK_STOP_S,
+        sleep: Callable[[float], None], braking_s: float = QUICK_STOP_S, off_s: float = OFF_S,
     ) -> None:  # fmt: skip
-        """`braking_s`: how long a drive that brakes already may go on, QUICK_STOP_S at least; then its power goes."""
-        self._braking_s = max(braking_s, QUICK_STOP_S)
+        """`braking_s`: how long a drive that brakes already may go on, QUICK_STOP_S at least; then its power goes.
+
+        `off_s`: how long it may take until it is off, OFF_S at least.
+        """
+        self._braking_s, self._off_s = max(braking_s, QUICK_STOP_S), max(off_s, OFF_S)
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
@@ -124,7 +127,7 @@ class SwitchOff:
         self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
         self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
         brake(self._objects, self._sleep, self._braking_s)
-        for _ in range(round(OFF_S / POLL_S)):
+        for _ in range(round(self._off_s / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
             state = state_of(self._objects)
             if state in OFF_STATES:
@@ -162,6 +165,7 @@ def stop_node(
     encoder_node: int | None = None,
     sdo_timeout_s: float | None = None,
     braking_s: float | None = None,
+    off_s: float | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> str:
     """Stop and disable the drive at `node`, another controller's as well; closes `bus`.  See `SwitchOff.make_safe`."""
@@ -171,7 +175,8 @@ def stop_node(
         remote = network.add_node(node, _standard_objects())
         remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
         objects = ObjectAccess(remote, "CiA 402")
-        switch_off = SwitchOff(network, node, objects, encoder_node, sleep, braking_s or QUICK_STOP_S)
+        times_s = braking_s or QUICK_STOP_S, off_s or OFF_S
+        switch_off = SwitchOff(network, node, objects, encoder_node, sleep, *times_s)
         return switch_off.make_safe(brake_first=True)
     finally:
         with contextlib.suppress(Exception):  # what went wrong on it has been reported

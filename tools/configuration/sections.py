@@ -202,7 +202,8 @@ class Sequence(Section):
     # for the drive to switch on, its brake included
     enable_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]
     stop_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]  # for a stop, then the power goes
-    off_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]  # for the drive to say that it is off
+    # for the drive to say that it is off, its brake included
+    off_timeout_s: Annotated[float, between(0.0, 60.0, open_low=True)]
     # the loop stops the joint when its supervisor is silent for longer
     supervisor_timeout_s: Annotated[float, between(0.02, 60.0)]
 

@@ -214,7 +214,8 @@ def stop_within_s(config: Config) -> float:
     """How long the program may take to end after `jointctl stop`: quick stop, switching off, read back, files."""
     sequence = config.sequence
     braking_s = max(QUICK_STOP_S, sequence.stop_timeout_s)  # once more, of a drive that the loop does not reach
-    return sequence.stop_timeout_s + sequence.off_timeout_s + braking_s + OFF_S + FILES_S
+    off_s = max(OFF_S, sequence.off_timeout_s)
+    return sequence.stop_timeout_s + sequence.off_timeout_s + braking_s + off_s + FILES_S
 
 
 @contextmanager

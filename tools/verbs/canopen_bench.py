@@ -38,6 +38,7 @@ class CanTarget:
     encoder_node: int | None = None
     sdo_timeout_s: float | None = None
     braking_s: float | None = None
+    off_s: float | None = None
 
     @property
     def place(self) -> tuple[str, str]:
@@ -48,8 +49,9 @@ class CanTarget:
 
         bus = open_python_can(self.interface, self.channel, self.bitrate_bitps, exclusive=False)
         return stop_node(
-            bus, self.node, encoder_node=self.encoder_node, sdo_timeout_s=self.sdo_timeout_s, braking_s=self.braking_s
-        )
+            bus, self.node, encoder_node=self.encoder_node, sdo_timeout_s=self.sdo_timeout_s, braking_s=self.braking_s,
+            off_s=self.off_s,
+        )  # fmt: skip
 
 
 class CanopenBench(BenchDrive):
@@ -79,7 +81,7 @@ class CanopenBench(BenchDrive):
         return CanTarget(
             interface, channel, bitrate, node,
             encoder_node if _whole(encoder_node, 1, HIGHEST_NODE) else None, keys.seconds("drive", "sdo_timeout_s"),
-            keys.seconds("sequence", "stop_timeout_s", 60.0),
+            keys.seconds("sequence", "stop_timeout_s", 60.0), keys.seconds("sequence", "off_timeout_s", 60.0),
         )  # fmt: skip
 
     def info(self, asked: Asked, output: Output) -> int:

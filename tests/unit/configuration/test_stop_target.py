@@ -48,7 +48,7 @@ def test_what_is_wrong_elsewhere_does_not_matter(tmp_path: Path, changes: tuple[
     shipped = load_config(CONFIGS / "virtual.toml")
     assert stop_target(path, environ=NOTHING) == CanTarget(
         shipped.bus.interface, shipped.bus.channel, None, canopen_section(shipped).node,
-        braking_s=shipped.sequence.stop_timeout_s,
+        braking_s=shipped.sequence.stop_timeout_s, off_s=shipped.sequence.off_timeout_s,
     )  # fmt: skip
 
 
@@ -94,7 +94,8 @@ def test_without_any_file_the_command_line_is_enough(tmp_path: Path) -> None:
 
 def test_flag_beats_environment_beats_file(tmp_path: Path) -> None:
     path = edited_file(tmp_path)
-    expected = partial(CanTarget, braking_s=load_config(path).sequence.stop_timeout_s)
+    sequence = load_config(path).sequence
+    expected = partial(CanTarget, braking_s=sequence.stop_timeout_s, off_s=sequence.off_timeout_s)
     environ = {"CAN_INTERFACE": "slcan", "CAN_CHANNEL": "/dev/ttyACM0", "CAN_BITRATE": "250000"}
     assert stop_target(path, environ=environ) == expected("slcan", "/dev/ttyACM0", 250_000, 1)
     assert stop_target(path, GivenPlace(channel="x", bitrate=125_000), environ) == expected("slcan", "x", 125_000, 1)

@@ -18,7 +18,15 @@ import pytest
 from jointctl.drivers import bus_lock
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia import NmtCommand, State
-from jointctl.drivers.canopen.switch_off import POLL_S, QUICK_STOP_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
+from jointctl.drivers.canopen.switch_off import (
+    OFF_S,
+    POLL_S,
+    QUICK_STOP_S,
+    SDO_TIMEOUT_S,
+    SwitchOff,
+    brake,
+    brake_if_enabled,
+)
 from jointctl.drivers.drive import (
     UNTOUCHED,
     CommissioningReport,
@@ -148,9 +156,9 @@ class DriveInMemory:
     def wait(self, seconds: float) -> None:
         self.log.append(seconds)
 
-    def made_safe(self, braking_s: float = QUICK_STOP_S, **how: bool) -> str:
+    def made_safe(self, braking_s: float = QUICK_STOP_S, off_s: float = OFF_S, **how: bool) -> str:
         bus: Any = self
-        return SwitchOff(bus, 1, bus, 7, self.wait, braking_s).make_safe(**how)
+        return SwitchOff(bus, 1, bus, 7, self.wait, braking_s, off_s).make_safe(**how)
 
 
 @pytest.mark.parametrize(
@@ -242,6 +250,15 @@ def test_anothers_drive_that_brakes_for_long_keeps_its_power_until_it_stands(bra
     assert drive.made_safe(braking_s, brake_first=True) == "switch on disabled"
     at_rest = 150 if braking_s == 3.0 else 100
     assert drive.log[: drive.log.index(NO_VOLTAGE)].count(POLL_S) == at_rest
+
+
+@pytest.mark.parametrize(
+    ("off_s", "state"), [(3.0, "switch on disabled"), (0.5, "quick stop active, it did not obey; NMT stop was sent")]
+)
+def test_a_drive_may_take_as_long_to_be_off_as_its_configuration_says(off_s: float, state: str) -> None:
+    """As one that waits for its brake; the twin is called disobedient after a second, as ever."""
+    drive = DriveInMemory(*[BRAKING] * 190, OFF)  # 1 s for its quick stop, then 2.8 s
+    assert drive.made_safe(off_s=off_s) == state
 
 
 @pytest.mark.parametrize("refused", [0x6071, 0x60FF])
