@@ -218,6 +218,13 @@ class LiveMotor:
         self._raise()
 
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
+        try:
+            self._enable(approve)
+        except BaseException:
+            self._ask_end()  # behind an `enable` that was interrupted nothing may begin, whatever becomes of that
+            raise
+
+    def _enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
         approval, session = self._approval, self._session
         if approval is None or session is None:
             raise MotionFault(*NOT_COMMISSIONED)
@@ -293,6 +300,11 @@ class LiveMotor:
         if self._session is not None:
             drive_end.require_off(self._session.drive_state)
 
+    def _ask_end(self) -> None:
+        if self._control is not None:
+            signals = self._control.signals
+            signals.name, signals.count = signals.name or WHO, max(signals.count, 1)
+
     def _end(self) -> None:
         """Ask for the end, and wait for it whatever is raised here in between: by a signal of the program's, say.
 
@@ -305,7 +317,7 @@ class LiveMotor:
         raised: BaseException | None = None
         while not self._over:
             try:
-                signals.name, signals.count = signals.name or WHO, max(signals.count, 1)
+                self._ask_end()
                 self._join()
             except KeyboardInterrupt as error:
                 signals.count, raised = signals.count + 1, error

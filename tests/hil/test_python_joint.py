@@ -326,6 +326,37 @@ def test_a_yes_does_not_count_after_a_standstill(bench: Any, stood_s: float, ref
     assert bench.disabled()
 
 
+INTERRUPTED = """
+import _thread, sys, threading, time
+import jointctl
+
+def before_the_yes(lines):
+    raise KeyboardInterrupt
+
+def behind_the_yes(lines):
+    threading.Timer(0.05, _thread.interrupt_main).start()
+    return True
+
+with jointctl.Joint("joint.toml") as joint:
+    try:
+        joint.enable({approve})
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr, flush=True)
+    time.sleep(4.0)
+    joint.wait(0.1)
+"""
+
+
+@pytest.mark.parametrize("approve", ["before_the_yes", "behind_the_yes"])
+def test_an_enable_that_is_interrupted_ends_the_run_whatever_the_program_does_then(bench: Any, approve: str) -> None:
+    bench.with_joint()
+    ended = bench.program(INTERRUPTED.format(approve=approve)).finished(60.0)
+    assert ended.code == 1
+    assert "interrupted" in ended.err
+    assert "the run has ended, by the program; the joint is off" in ended.err
+    assert bench.disabled()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")
