@@ -238,6 +238,7 @@ _SCALE_CURE = (
 )
 
 _SWAPPED_CURE = "swap encoder.counts_per_turn and joint_encoder.counts_per_turn if the makers' data agree"
+_PLUGS_CURE = "swap the cables of the two encoders, or which object of the drive each is read from"
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
@@ -359,7 +360,8 @@ def motion_findings(
     held_cycles = 1 if fault is Fault.POSITION_FROZEN else round(HELD_s * config.loop.rate_Hz)
     motion = motion_of(records, threshold_rad, held_cycles)
     if motion is None:
-        if fault is Fault.POSITION_DISAGREEMENT and len(records) and records.position_rad[-1]:
+        misplaced = fault in (Fault.POSITION_DISAGREEMENT, Fault.POSITION_LIMIT)
+        if misplaced and len(records) and records.position_rad[-1]:
             places = float(records.second_position_rad[-1] / records.position_rad[-1])
             yield from _swapped(config, law, other, places, SAME_PLACE)
         yield ended_finding(records, fault, text)
@@ -420,19 +422,25 @@ def _standing(
 def _swapped(
     config: Config, law: str, other: str, ratio: float | None, tolerance: float = SAME_SCALE
 ) -> Iterator[Finding]:
-    """One where `ratio`, of the other encoder over that of the law, is as with the counts of each in the other's key.
+    """One where `ratio`, of the other encoder over that of the law, is that of the counts of each in the other's key.
 
-    Each reading is wrong by the ratio of their counts then, one too long and one too short.
+    Or that of the readings of each in the place of the other: cables, or the drive's objects.  Each is wrong by the
+    quotient of their counts then, in the key or of the joint, one too long and one too short.
     """
     if config.joint_encoder is None or ratio is None:
         return
     own, second = config.encoder.counts_per_turn, config.joint_encoder.counts_per_turn
-    expected = (second / own) ** (2 if law == "joint_encoder" else -2)
-    if abs(expected - 1.0) <= SAME_SCALE or abs(abs(ratio) / expected - 1.0) > tolerance:
-        return
-    text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}], as if encoder.counts_per_turn (={own}) and "
-    text += f"joint_encoder.counts_per_turn (={second}) were swapped"
-    yield Finding("scale", PROBLEM, text, _SWAPPED_CURE, {"other_ratio": ratio})
+    keys = f"encoder.counts_per_turn (={own}) and joint_encoder.counts_per_turn (={second})"
+    own_of_joint = math.tau / abs(joint_rad_per_count(config))
+    for counts, what, cure in (
+        (own, keys, _SWAPPED_CURE),
+        (own_of_joint, "the readings of [encoder] and [joint_encoder]", _PLUGS_CURE),
+    ):
+        expected = (second / counts) ** (2 if law == "joint_encoder" else -2)
+        if abs(expected - 1.0) > SAME_SCALE and abs(abs(ratio) / expected - 1.0) <= tolerance:
+            text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}], as if {what} were swapped"
+            yield Finding("scale", PROBLEM, text, cure, {"other_ratio": ratio})
+            return
 
 
 def _encoders(config: Config, motion: Motion, along: bool | None, law: str, other: str) -> Iterator[Finding]:

@@ -488,6 +488,26 @@ def test_counts_in_the_key_of_the_other_encoder(
     assert (AxisPhase.APPROACH in records.phase) == (start_rad == 0.0)
 
 
+@pytest.mark.parametrize("start_rad", [0.0, 0.1])
+@pytest.mark.parametrize("swapped", [True, False])
+def test_readings_in_the_place_of_the_other_encoder(tmp_path: Path, swapped: bool, start_rad: float) -> None:
+    """On the motor and on the joint: the one that turns less was taken for dead."""
+    config = config_with(
+        tmp_path, {**NODE, "law": "encoder", "counts_per_turn": 524288}, encoder__side="motor",
+        encoder__counts_per_turn=65536, virtual__initial_position_rad=start_rad,
+    )  # fmt: skip
+    joint, plan = LockstepJoint(config), make_plan(config, None)
+    if swapped:
+        joint._port[0].position_radpcount *= 524288 / 65536 / 121.0
+        joint._port[0].second.radpcount *= 121.0 * 65536 / 524288
+    records, _, fault = check_in_lockstep(joint, config, plan)
+    found = [finding.text for finding in motion_findings(config, plan, records, fault, None)]
+    said = "as if the readings of [encoder] and [joint_encoder] were swapped"
+    assert [text.endswith(said) for text in found].count(True) == swapped, found
+    assert (fault is Fault.NONE) is not swapped
+    assert not any("stood still" in text for text in found)
+
+
 def test_an_encoder_that_stood_did_not_go_the_same_way(tmp_path: Path) -> None:
     config = config_with(tmp_path, NODE, virtual__initial_position_rad=0.0)
 
