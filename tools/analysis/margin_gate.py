@@ -288,7 +288,11 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
     longest_s = longest_delay_s(worst, minimum_deg)
     if longest_s is not None and longest_s > 0.0:
         texts.append(f"a loop delay of {longest_s * 1e3:g} ms or less")
-    hint = "any one of: " + "; ".join(texts) if texts else "no single setting reaches it: lower kp, kv and q together"
+    hint = "any one of: " + "; ".join(texts)
+    if not texts:
+        rest = {ControllerKind.PID: "ki", ControllerKind.COMPUTED_TORQUE_RBF: "lyapunov_q"}.get(settings.kind, "filter")
+        gains = f"kp, kv and {'observer_radps' if settings.kind in OBSERVING else rest}"
+        hint = f"no single setting reaches it: `jointctl check CONFIG --choose-gains` searches {gains} together"
     return MarginError(f"{what}: {where}", hint)
 
 
@@ -310,7 +314,7 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
 
 _LOWEST_radps, _POINTS = 1e-2, 20_000
 _LEAST_DAMPING = 0.002  # of the critical one, of a reducer: a resonance without any falls between two points
-TWIST = "twist correction"
+TWIST, POSITION_LOOP = "twist correction", "position loop"
 SAMPLES_LATE = 1.5  # of a sampled loop: one to compute, half for holding
 
 
@@ -416,7 +420,7 @@ def _cascade_margins(config: Config, delay_s: float, joint: TwoMasses | None) ->
         return []  # nothing is known of what the position loop is closed around
     if cascade.position_gain_ps is not None:
         position = cascade.position_gain_ps / s * closed * (fed / own) * np.exp(-s * late_s)
-        found.append(_margin("position loop", omega, position, all(loop.stable for loop in found)))
+        found.append(_margin(POSITION_LOOP, omega, position, all(loop.stable for loop in found)))
         corrects_twist = config.control.kind == "flexible_joint" and encoders_of_law(config) == Encoders.BOTH
         if kind is CommandKind.POSITION and joint is not None and corrects_twist:
             twist = shafts["joint"] / shafts["motor"] - 1.0  # of the link against a motor that follows its target
@@ -448,11 +452,23 @@ def require_cascade(config: Config, delay_s: float, *, allow_low_margin: bool = 
                 f"drive.mode (={_section(config).mode}): the phase margin of the {loop.name} "
                 f"(={loop.phase_margin_deg:.1f} deg{'' if loop.stable else ', unstable'}) must be at least "
                 f"{minimum_deg:g} deg{f'; worst case: {loop.joint}' if loop.joint else ''}",
-                f"a lower control.twist_radps (now {config.control.twist_radps:g})"
-                if loop.name == TWIST
-                else "correct the gains in [drive.cascade], and those of the drive with its maker's software",
+                _cascade_cure(config, loop),
             )
     return found
+
+
+def _cascade_cure(config: Config, loop: LoopMargin) -> str:
+    """What changes the margin of this loop."""
+    cascade = cascade_of(config)
+    if loop.name == TWIST:
+        return f"a lower control.twist_radps (now {config.control.twist_radps:g})"
+    if config.drive.own_loop() is not CommandKind.VELOCITY or loop.name != POSITION_LOOP:
+        return "correct the gains in [drive.cascade], and those of the drive with its maker's software"
+    cure = f"a lower drive.cascade.position_gain_ps (now {cascade.position_gain_ps:g})"
+    if cascade.velocity_gain_Nmspr is None or cascade.velocity_integral_Nmprad is None:
+        cure += "; or the drive's velocity_gain_Nmspr and velocity_integral_Nmprad: without both its velocity loop "
+        cure += "is taken for one that is infinitely quick"
+    return cure
 
 
 def cascade_text(config: Config, delay_s: float, *, allow_low_margin: bool = False) -> str:

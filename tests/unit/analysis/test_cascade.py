@@ -142,6 +142,21 @@ def test_a_drive_that_closes_its_loops_over_a_soft_reducer_is_refused() -> None:
         require_cascade(shipped_one.model_copy(update={"drive": stiff.drive}), 1e-3)
 
 
+def test_a_loop_that_is_closed_here_is_not_blamed_on_the_drives_gains() -> None:
+    """Where the drive's velocity loop is not known it is taken for the quickest."""
+    soft = shipped("realistic")
+    known = {"velocity_gain_Nmspr": 500.0, "velocity_integral_Nmprad": 40_000.0}
+    for gains in (known, dict.fromkeys(known)):
+        config = soft.model_copy(update={"drive": own_loop("csv", position_gain_ps=50.0, **gains).drive})
+        with pytest.raises(MarginError, match="position loop") as caught:
+            require_cascade(config, 1e-3)
+        assert caught.value.hint.startswith("a lower drive.cascade.position_gain_ps (now 50)")
+        assert ("infinitely quick" in caught.value.hint) == (gains is not known)
+    with pytest.raises(MarginError, match="position loop") as caught:
+        require_cascade(own_loop(position_gain_ps=900.0), 1e-3)
+    assert "those of the drive with its maker's software" in caught.value.hint
+
+
 def test_csv_closes_the_position_loop_here_and_feels_our_delay() -> None:
     quick, slow = (cascade_margins(own_loop("csv"), delay)[1].phase_margin_deg for delay in (1e-3, 5e-3))
     assert slow < quick

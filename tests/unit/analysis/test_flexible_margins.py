@@ -215,6 +215,16 @@ def test_the_link_alone_is_not_to_be_had_with_the_gains_for_both():
         assert margins(slow).stable
 
 
+def test_where_no_setting_helps_the_hint_names_gains_that_the_law_has() -> None:
+    """It named q, of the network; these laws have none."""
+    link = with_encoders(believed(reducer__map=None), Encoders.LINK)
+    rigid = changed(link, control__kind="computed_torque_observer", control__kp=3600.0, control__kv=120.0)
+    for config in (link, rigid):
+        with pytest.raises(MarginError, match="unstable") as caught:
+            require_margin(config)
+        assert caught.value.hint.endswith("--choose-gains` searches kp, kv and observer_radps together")
+
+
 # --- gains for what is believed of a joint ---
 def believed(**changes: Any) -> Config:
     return shipped("realistic", **changes)
