@@ -120,8 +120,8 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
     ),
     Fault.REFERENCE_LIMIT: FaultWords(
         "the desired motion would leave the limits at {value:.4f} rad",
-        "the trajectory, or its approach from where the joint stands, does not fit the limits",
-        "change the trajectory, the start position or limits.*",
+        "the trajectory, braked on its way, or its approach from where the joint stands, does not fit the limits",
+        "change the trajectory, the start position, sequence.brake_radps2 or limits.*",
     ),
     Fault.FOLLOWING_ERROR: FaultWords(
         "the joint was {value:.4f} rad away from its reference",

@@ -17,12 +17,13 @@ import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, blamed, text_Nm
-from jointctl.firmware_py.motion_records import TrajectoryConstants
+from jointctl.firmware_py.kernel import plain
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.safety import ROUNDING_rad
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import Fault
-from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
+from jointctl.firmware_py.states import Fault, TrajectoryKind
+from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of, reference_at
 from jointctl.tools.analysis.margin_gate import require_loop, require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import (
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
 
 UNTIL_STOPPED_s = 60.0  # of a motion without an end that are looked at
+ON_THE_WAY = 300  # places of a motion that are looked at
+BEYOND_rad = 1e-4  # that a place of rest may be: less may be rounding, and what is allowed for the jerk
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 
 
@@ -321,13 +324,14 @@ class ConfiguredMotion:
     def envelope(self, axis: AxisConstants, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint will go, how fast, with how much torque, for how long.
 
-        `MotionFault` as of `require_approach`.
+        `MotionFault` as of `require_approach` and `require_braking`.
         """
         config = self.config
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
         first = approach_start(axis.trajectory, self.table)
         approach = float(axis.sequence.approach_s)
         require_approach(config.limits, axis, self.table, report.start_position_rad)
+        require_braking(config, axis.trajectory, self.table)
         duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
         rounding_s = float(axis.trajectory.rounding_s)
@@ -363,6 +367,55 @@ def require_approach(limits: Limits, axis: AxisConstants, table: np.ndarray, sta
                 "begin nearer to the beginning of the motion (of an arm with all joints), with a shorter "
                 "sequence.approach_s where that is a number, or with a motion that begins at rest",
             )
+
+
+def require_braking(config: Config, trajectory: TrajectoryConstants, table: np.ndarray) -> None:
+    """`MotionFault` where the trajectory, braked on the way, would come to rest beyond the limits: REFERENCE_LIMIT."""
+    limits, brake_radps2 = config.limits, config.sequence.brake_radps2
+    position_rad, velocity_radps = _on_the_way(trajectory, table)
+    rest_rad = position_rad + 0.5 * velocity_radps * np.abs(velocity_radps) / brake_radps2
+    beyond_rad = np.maximum(rest_rad - limits.position_max_rad, limits.position_min_rad - rest_rad)
+    worst = int(np.argmax(beyond_rad))
+    if beyond_rad[worst] > BEYOND_rad:
+        raise MotionFault(
+            f"at {position_rad[worst]:+.4f} rad the trajectory has {velocity_radps[worst]:+.3f} rad/s, and would "
+            f"come to rest at {rest_rad[worst]:+.4f} rad with sequence.brake_radps2 (={brake_radps2:g}), must be in "
+            f"[{limits.position_min_rad:g}..{limits.position_max_rad:g}], the limits.position_*_rad",
+            "a greater sequence.brake_radps2, a slower motion, or wider limits",
+        )
+
+
+def _on_the_way(trajectory: TrajectoryConstants, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities of one period of the trajectory, or of its whole table."""
+    c: Any = trajectory
+    if c.kind == TrajectoryKind.TABLE:
+        rows = table[: int(c.table_rows)]
+        since_s = np.diff(rows[:, 0])[:, None] * np.linspace(0.0, 1.0, 5)
+        c0, c1, c2, c3 = (rows[:-1, k, None] for k in range(1, 5))
+        position = c0 + since_s * (c1 + since_s * (c2 + since_s * c3))
+        return position.ravel(), (c1 + since_s * (2.0 * c2 + since_s * 3.0 * c3)).ravel()
+    run_s = float(c.duration_s) or math.inf
+    switch_s = float(c.switch_s) or math.inf
+    spans = [(0.0, float(c.move_s))]
+    if c.kind == TrajectoryKind.SINE:
+        spans = [(0.0, min(run_s, switch_s, math.tau / c.omega_radps))]
+        if switch_s < run_s:
+            spans.append((switch_s, min(run_s, switch_s + math.tau / c.omega2_radps)))
+    elif c.kind == TrajectoryKind.TRAPEZOID:
+        way_rad, speed_radps = abs(c.target_rad - c.start_rad), float(c.speed_radps)
+        slopes_s = 2.0 * (speed_radps / c.acceleration_radps2 + c.rounding_s)
+        spans = [(0.0, way_rad / speed_radps + slopes_s)]
+    reference, at = new(Reference)[0], plain(reference_at)
+    found = []
+    for begin_s, end_s in spans:
+        for t_s in np.linspace(begin_s, min(end_s, run_s), ON_THE_WAY):
+            at(trajectory, table, 0, t_s, reference)
+            found.append((reference.position_rad, reference.velocity_radps))
+    position, velocity = np.array(found).T
+    if c.repeats:  # the same way back
+        ends_rad = c.start_rad + c.target_rad
+        return np.concatenate([position, ends_rad - position]), np.concatenate([velocity, -velocity])
+    return position, velocity
 
 
 # --- The one conversation before something is done to a joint or its drive: what is shown, and who says yes ---

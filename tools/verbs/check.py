@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import UsageError, blamed, text_Nm
+from jointctl.drivers.errors import MotionFault, UsageError, blamed, text_Nm
 from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -76,7 +76,7 @@ def check(
     table = _table(analysis)
     for row in drive.check_rows(config):
         table.add_row(*row)
-    learning, warnings = learning_of(config, settings), contradictions(config)
+    learning, warnings = learning_of(config, settings), [*contradictions(config), *_unbraked(config)]
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         value += "" if learning.worst_factor < 1.0 else ": diverges"
@@ -108,12 +108,29 @@ def check(
     return 0
 
 
+def _unbraked(config: Config) -> Iterator[str]:
+    """Why `run` would refuse the motion: known without a file of it."""
+    from jointctl.firmware_py.motion_records import TrajectoryConstants
+    from jointctl.firmware_py.schema import new
+    from jointctl.tools.configuration.records import fill_trajectory, trajectory_table
+    from jointctl.tools.session.plan import require_braking
+
+    if config.trajectory.kind != "table":
+        trajectory, table = new(TrajectoryConstants), trajectory_table(config)
+        fill_trajectory(trajectory[0], config, table)
+        try:
+            require_braking(config, trajectory[0], table)
+        except MotionFault as error:
+            yield f"{error.message}; {error.hint}"
+
+
 def check_cascade(
     config: Config, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False
 ) -> int:
     """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
     from jointctl.drivers.canopen.eds import read_eds
     from jointctl.tools.analysis.linear_loop import loop_settings
+    from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_of, cascade_unknowns, require_cascade
     from jointctl.tools.configuration.canopen import canopen_section, eds_path
     from jointctl.tools.verbs.bench_drive import bench_of
@@ -149,11 +166,14 @@ def check_cascade(
         enough = all(loop.stable and loop.phase_margin_deg >= wanted_deg for loop in found)
         wanted = f"at least {wanted_deg:g} deg wanted (margin.min_phase_margin_deg)"
         table.add_row("verdict", "ok" if enough else "too small", wanted)
+    warnings = [*contradictions(config), *_unbraked(config)]
     data = {
         "mode": section.mode, "lead_s": lead, "loops": [asdict(loop) for loop in found],
-        "min_phase_margin_deg": wanted_deg,
+        "min_phase_margin_deg": wanted_deg, "warnings": warnings,
     }  # fmt: skip
     output.result(table, data)
+    for text in warnings:
+        output.warning(text)
     for text in cascade_unknowns(config):
         output.note(f"not in this analysis: {text}")
     require_cascade(config, delay.value, allow_low_margin=allow_low_margin)

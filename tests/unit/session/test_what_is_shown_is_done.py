@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,12 +17,14 @@ from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import ConfigurationError, DeviceError, MotionFault
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.friction import branch_torque_Nm
+from jointctl.firmware_py.motion_records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault
 from jointctl.tools.configuration import checks
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import MOVED_COUNTS
+from jointctl.tools.configuration.records import MOVED_COUNTS, fill_trajectory
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, motion_table
 from jointctl.tools.inspection.motion_check import make_plan as check_plan
 from jointctl.tools.lockstep import LockstepJoint
@@ -29,7 +32,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.session import run_watch as run_watch_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
-from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.plan import require_braking, resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.options import SweepOptions, both_directions, ordered_points
@@ -48,6 +51,57 @@ AT_ONCE = ('approach_s = "auto"', "approach_s = 0")
 
 def report(start_rad: float = 0.1, **more: Any) -> CommissioningReport:
     return CommissioningReport(DriveIdentity("", "", "", ""), "cyclic_sync_torque", start_rad, 0.06, 1e-5, **more)
+
+
+BACK_AND_FORTH = {"duration_s": 6.0, "start_rad": -0.5, "target_rad": 0.55, "dwell_s": 0.1, "repeat": True}
+SINES = {"kind": "sine", "duration_s": 6.0, "amplitude_rad": 0.2, "frequency_Hz": 0.2}
+
+
+@pytest.mark.parametrize("name", ["virtual", "realistic"])
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"kind": "min_jerk", "move_s": 1.0, **BACK_AND_FORTH},
+        {"kind": "trapezoid", "speed_radps": 1.5, "acceleration_radps2": 5.0, "jerk_radps3": 50.0, **BACK_AND_FORTH},
+        {**SINES, "amplitude_rad": 0.5, "frequency_Hz": 0.5, "shift_s": 0.5},
+        {"kind": "table", "file": "way.csv", "duration_s": 2.0},
+    ],
+)
+def test_a_motion_that_could_not_be_braked_is_refused_before_it_begins(
+    tmp_path: Path, motion: dict[str, Any], name: str
+) -> None:
+    """It was shown and followed, up to where the loop saw that: REFERENCE_LIMIT in the middle of the range."""
+    times = np.linspace(0.0, 1.0, 101)
+    way = -0.5 + 1.05 * times**3 * (10.0 - 15.0 * times + 6.0 * times**2)
+    rows = [f"{t:.4f},{x:.9f}" for t, x in zip(times, way, strict=True)]
+    (tmp_path / "way.csv").write_text("\n".join(["time_s,position_rad", *rows]) + "\n")
+
+    def braked(brake_radps2: float) -> Config:
+        changes = {"sequence__brake_radps2": brake_radps2, "sequence__stop_timeout_s": 60.0}
+        path = written(tmp_path / "j.toml", name, trajectory=motion, limits__velocity_max_radps=3.0, **changes)
+        return load_config(path)
+
+    log = LockstepJoint(braked(1e3)).run().log
+    log = log[log.phase == AxisPhase.TRACKING]
+    room_rad = 0.7 - np.sign(log.desired_velocity_radps) * log.desired_position_rad
+    least = float(np.max(0.5 * log.desired_velocity_radps**2 / room_rad))
+    for brake in (0.97 * least, 1.03 * least):
+        config, refused = braked(brake), brake < least
+        with pytest.raises(MotionFault, match=r"brake_radps2 \(=.*\), must be in") if refused else nullcontext():
+            resolve(config).motion.placed(report(0.0))
+        assert (LockstepJoint(config).run().fault is Fault.REFERENCE_LIMIT) is refused
+
+
+@pytest.mark.parametrize(("duration_s", "refused"), [(2.2, False), (6.0, True), (0.0, True)])
+def test_the_second_sine_must_be_braked_too(tmp_path: Path, duration_s: float, refused: bool) -> None:
+    second = {"at_s": 2.4, "amplitude_rad": 0.5, "frequency_Hz": 0.5, "shift_s": 1.6, "offset_rad": 0.0}
+    motion = {**SINES, "duration_s": duration_s, "frequency_Hz": 1.25, "shift_s": 0.0, "switch": second}
+    changes = {"trajectory": motion, "limits__velocity_max_radps": 3.0}
+    config = load_config(written(tmp_path / "j.toml", **changes))
+    constants = new(TrajectoryConstants)
+    fill_trajectory(constants[0], config, np.zeros((1, 5)))
+    with pytest.raises(MotionFault, match="would come to rest at") if refused else nullcontext():
+        require_braking(config, constants[0], np.zeros((1, 5)))
 
 
 def test_the_jerk_of_a_rounded_trapezoid_is_shown(tmp_path: Path) -> None:
