@@ -12,7 +12,7 @@ import numpy as np
 from jointctl.drivers.errors import text_Nm
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
-from jointctl.tools.analysis.margin_gate import encoder_step_Nm
+from jointctl.tools.analysis.margin_gate import coarsest
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import (
     law_resolution_rad,
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 # --- What the linear loop does not know ---
 
 
+SOFT_STEP_SHARE = (
+    0.05  # the same of the law of a flexible joint: 15 bit at the link of `realistic` is above, with 1.8 Nm a cycle
+)
 STEP_SHARE = 0.25  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it is noisy, above
 OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
 
@@ -76,12 +79,12 @@ def not_modelled(config: Config) -> list[str]:
             f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
             "which takes margin that is not counted here"
         )
-    step_Nm = encoder_step_Nm(config, loop_settings(config)[0])
-    if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
+    step_Nm, counts, cure = coarsest(config, loop_settings(config)[0])
+    share = SOFT_STEP_SHARE if control.kind == "flexible_joint" else STEP_SHARE
+    if step_Nm > share * config.limits.torque_max_Nm:
         found.append(
-            f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
-            f"{text_Nm(step_Nm)}, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
-            'it will chatter; lower kv or velocity_cutoff_Hz, or take control.velocity_filter = "kalman"'
+            f"{counts}: one count moves the torque by {text_Nm(step_Nm)}, more than {share:.0%} of "
+            f"limits.torque_max_Nm: it will chatter; {cure}"
         )
     return found
 

@@ -228,17 +228,34 @@ def refuse_diverging_learning(found: Convergence | None) -> None:
 
 def encoder_step_Nm(config: Config, settings: LoopSettings) -> float:
     """By how much the law moves the torque, in that cycle, when an encoder counts one on; of two the greater one."""
-    counts_rad = [law_resolution_rad(config)]
-    if settings.kind == ControllerKind.FLEXIBLE_JOINT and settings.encoders != Encoders.LINK:
-        both = settings.encoders == Encoders.BOTH
-        counts_rad = [*counts_rad, abs(joint_rad_per_count(config))] if both else [abs(joint_rad_per_count(config))]
-    steps_Nm = np.abs(CONTROLLERS[settings.kind](settings).d[0]) * counts_rad
-    return float(np.max(steps_Nm))
+    return coarsest(config, settings)[0]
+
+
+def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
+    """(see `encoder_step_Nm`, the counts of that encoder by their key, what lowers the step)."""
+    second, resolution_rad = config.joint_encoder, law_resolution_rad(config)
+    own = f"encoder.counts_per_turn (={config.encoder.counts_per_turn})"
+    law = own
+    if second is not None and second.law == "joint_encoder":
+        law = f"joint_encoder.counts_per_turn (={second.counts_per_turn})"
+    steps_Nm = np.abs(CONTROLLERS[settings.kind](settings).d[0])
+    if settings.kind != ControllerKind.FLEXIBLE_JOINT:
+        cure = (
+            'control.velocity_filter = "kalman" (of computed_torque_observer), or lower control.velocity_cutoff_Hz, kv '
+        )
+        return float(np.max(steps_Nm) * resolution_rad), law, f"{cure}and observer_radps"
+    of_law = "lower control.observer_radps and velocity_cutoff_Hz"
+    if settings.encoders == Encoders.BOTH:
+        of_law = "lower control.observer_radps and link_cutoff_Hz"
+        of_motor_Nm = float(steps_Nm[1] * abs(joint_rad_per_count(config)))
+        if of_motor_Nm > steps_Nm[0] * resolution_rad:
+            return of_motor_Nm, own, "lower control.kv, observer_radps and velocity_cutoff_Hz"
+    return float(np.max(steps_Nm[0]) * resolution_rad), law, of_law
 
 
 def refuse_chatter(config: Config, settings: LoopSettings) -> None:
     """`MarginError` where the torque that moves the joint and one count on top of it reach the limit."""
-    step_Nm, limit_Nm = encoder_step_Nm(config, settings), config.limits.torque_max_Nm
+    (step_Nm, counts, cure), limit_Nm = coarsest(config, settings), config.limits.torque_max_Nm
     holding_Nm = (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
     if holding_Nm >= limit_Nm:
         raise MarginError(
@@ -247,10 +264,9 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
         )
     if step_Nm + holding_Nm >= limit_Nm:
         raise MarginError(
-            f"the torque would chatter at its limit: one count of the encoder moves it by {text_Nm(step_Nm)}, friction "
+            f"the torque would chatter at its limit: one count of {counts} moves it by {text_Nm(step_Nm)}, friction "
             f"and gravity need {text_Nm(holding_Nm)}; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
-            'an encoder with more counts, control.velocity_filter = "kalman", or lower control.velocity_cutoff_Hz, kv '
-            "and observer_radps",
+            f"an encoder with more counts, {cure}",
         )
 
 

@@ -27,7 +27,7 @@ from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
-from tests.configurations import changed, shipped
+from tests.configurations import changed, shipped, written
 from tests.places import CONFIGS
 
 
@@ -59,6 +59,17 @@ def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
         assert text in shown
     assert "drive.rpdo_transmission_type = 1, synchronous" in shown
     assert 'control.feed_forward = "measured"' in messages
+
+
+@pytest.mark.parametrize("name", ["virtual", "csp"])
+def test_a_motion_that_could_not_be_braked_is_a_warning(tmp_path: Path, name: str) -> None:
+    quick = {"kind": "min_jerk", "duration_s": 9.0, "start_rad": -0.5, "target_rad": 0.5, "move_s": 0.8}
+    for move_s, warned in ((0.8, True), (2.0, False)):
+        changes = {"trajectory": {**quick, "move_s": move_s}, "limits__velocity_max_radps": 3.0}
+        config = load_config(written(tmp_path / "j.toml", name, **changes))
+        shown, messages, code = run_check(config, json=True)
+        assert any("sequence.brake_radps2 (=2), must be" in line for line in json.loads(shown)["warnings"]) is warned
+        assert ("warning: at " in messages, code) == (warned, 0)
 
 
 def test_learning_and_contradictions_are_in_the_json_too() -> None:
@@ -463,6 +474,21 @@ def test_what_would_chatter_at_the_torque_limit_is_refused(changes: dict[str, An
     with pytest.raises(MarginError, match="chatter") if refused else nullcontext():
         require_margin(config)
     assert require_margin(config, allow_low_margin=True).stable
+
+
+@pytest.mark.parametrize(
+    ("counts", "named", "cure"),
+    [
+        ({"joint_encoder__counts_per_turn": 2**16}, "", ""),
+        ({"joint_encoder__counts_per_turn": 2**15}, "joint_encoder.counts_per_turn (=32768)", "radps and link_cutoff"),
+        ({"encoder__counts_per_turn": 2**10}, "encoder.counts_per_turn (=1024)", "observer_radps and velocity_cutoff"),
+    ],
+)
+def test_the_coarse_encoder_of_a_flexible_joint_is_named(counts: dict[str, int], named: str, cure: str) -> None:
+    """It was always [encoder], from 15 Nm a count on, with a filter that this law does not have as the remedy."""
+    said = [line for line in not_modelled(shipped("realistic", **counts)) if "it will chatter" in line]
+    assert all(line.startswith(f"{named}: one count") and cure in line and "kalman" not in line for line in said)
+    assert len(said) == bool(named)
 
 
 def test_the_step_of_a_count_is_that_of_position_rate_and_observer() -> None:
