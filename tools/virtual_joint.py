@@ -25,6 +25,7 @@ from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm
 from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import CommandKind
 from jointctl.hil.arm_plant import ArmPlant, arm_plant
 from jointctl.hil.canopen.device import Cia402Device, DeviceRow, DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
@@ -311,6 +312,12 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
     row = DeviceRow(new(Device, len(joints)), new(PlantConstants, len(joints)), new(PlantState, len(joints)))
     devices = []
     for index, config in enumerate(joints):
+        unit = canopen_section(config).velocity_unit
+        if unit != "counts/s" and config.drive.own_loop() is not CommandKind.TORQUE:
+            raise ConfigurationError(
+                f"{config.path}: drive.velocity_unit (={unit}) must be counts/s for the virtual drive to follow",
+                "leave it out of a copy of the file that is simulated",
+            )
         made = plant(**plant_settings(config))
         try:
             devices.append(

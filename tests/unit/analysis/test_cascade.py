@@ -256,6 +256,17 @@ def test_csv_needs_the_gain_of_the_position_loop_and_a_section(tmp_path: Any) ->
     )
 
 
+@pytest.mark.parametrize(
+    ("mode", "unit", "refused"), [("csv", "r/min", True), ("csp", "0.1 r/min", True), ("cst", "r/min", False)]
+)
+def test_a_unit_that_the_virtual_drive_does_not_have_is_refused(mode: str, unit: str, refused: bool) -> None:
+    """It took revolutions for counts: FOLLOWING_ERROR."""
+    config = shipped("virtual" if mode == "cst" else "csp", drive__velocity_unit=unit, drive__mode=mode)
+    words = rf"drive.velocity_unit \(={unit}\) must be counts/s"
+    with pytest.raises(ConfigurationError, match=words) if refused else nullcontext():
+        LockstepJoint(config)
+
+
 def test_a_serial_drive_has_no_such_mode(tmp_path: Any) -> None:
     text = (CONFIGS / "elmo_serial.toml").read_text()
     found = problems(tmp_path, r'kind = "elmo_serial"', 'kind = "elmo_serial"\nmode = "csp"', text)
