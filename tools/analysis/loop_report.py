@@ -33,10 +33,8 @@ if TYPE_CHECKING:
 # --- What the linear loop does not know ---
 
 
-SOFT_STEP_SHARE = (
-    0.05  # the same of the law of a flexible joint: 15 bit at the link of `realistic` is above, with 1.8 Nm a cycle
-)
 STEP_SHARE = 0.25  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it is noisy, above
+SOFT_STEP_SHARE = 0.05  # of a flexible joint's law; `realistic` with 15 bit at the link, 1.8 Nm a cycle, is above
 OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
 
 

@@ -240,10 +240,8 @@ def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
         law = f"joint_encoder.counts_per_turn (={second.counts_per_turn})"
     steps_Nm = np.abs(CONTROLLERS[settings.kind](settings).d[0])
     if settings.kind != ControllerKind.FLEXIBLE_JOINT:
-        cure = (
-            'control.velocity_filter = "kalman" (of computed_torque_observer), or lower control.velocity_cutoff_Hz, kv '
-        )
-        return float(np.max(steps_Nm) * resolution_rad), law, f"{cure}and observer_radps"
+        cure = 'control.velocity_filter = "kalman" (of computed_torque_observer), or lower control.velocity_cutoff_Hz'
+        return float(np.max(steps_Nm) * resolution_rad), law, f"{cure}, kv and observer_radps"
     of_law = "lower control.observer_radps and velocity_cutoff_Hz"
     if settings.encoders == Encoders.BOTH:
         of_law = "lower control.observer_radps and link_cutoff_Hz"
