@@ -19,7 +19,6 @@ from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import load_arm
 from jointctl.tools.experiments.judge import POWERED
-from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.virtual_joint import arm_plant_of, new_devices
 from tests.hil.test_arm_run import NAMES, OFF, ArmBench
 from tests.python_process import eventually
@@ -32,7 +31,7 @@ def on_two_buses(path: Path, channel: str) -> None:
     wrist.write_text(text.replace("node = 3", "node = 1"))
 
 
-class TwoBuses:
+class TwoBuses(ArmBench):
     """The arm's files on two buses of the test's own, and its virtual drives in a process of their own."""
 
     def __init__(self, bench: Any) -> None:
@@ -47,20 +46,14 @@ class TwoBuses:
         assert f"; node 1 on jointctl:{self.channels[1]}" in started.err
         return started
 
-    def tracking(self) -> Any:
-        return self.bench.start("run", self.path, "-y").saw("  tracking")
-
     def states(self) -> list[State]:
         """Of each drive, over SDO, in the order of the joints."""
         found = []
         for channel, nodes in zip(self.channels, ((1, 2), (1,)), strict=True):
             with can.Bus(interface="jointctl", channel=channel) as bus:
                 bus.send(can.Message(arbitration_id=0, data=[0x80, 0], is_extended_id=False))
-                found += [ArmBench._state(bus, node) for node in nodes]
+                found += [self._state(bus, node) for node in nodes]
         return found
-
-    def logs(self) -> list[Any]:
-        return [read_run_log(max(self.bench.folder.glob(f"runs/*.{name}.mcap"))) for name in NAMES]
 
 
 @pytest.fixture

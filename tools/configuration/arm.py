@@ -204,12 +204,11 @@ class ArmConfig:
         joints = tuple(joint.anchored() for joint in self.joints)
         return replace(self, path=self.path.absolute(), joints=joints)
 
-    def axis_constants(self, tables: Sequence[np.ndarray], starts_rad: Sequence[float] | None = None) -> Any:
+    def axis_constants(self, tables: Sequence[np.ndarray], starts_rad: Sequence[float]) -> Any:
         """A record array of N `AxisConstants`; `tables` as of `trajectory_table` of each joint."""
-        starts = [None] * len(self.joints) if starts_rad is None else list(starts_rad)
         parts = [
             axis_constants(config, table, start_position_rad=start)
-            for config, table, start in zip(self.joints, tables, starts, strict=True)
+            for config, table, start in zip(self.joints, tables, starts_rad, strict=True)
         ]
         return self.connected(parts)
 

@@ -27,6 +27,7 @@ from jointctl.firmware_py.schema import dtype_of
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmModel
 
+FOREVER = 1 << 62  # cycles
 RING_RECORDS = 1 << 14  # 16 s at 1 kHz
 _LINE = 64  # bytes; nothing of one array shares a cache line with another
 _LONG = 2048  # bytes of an array of which a cycle reads little

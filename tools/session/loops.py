@@ -20,13 +20,12 @@ from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.cycle import Exchange, Word
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.tools.child_process import say
-from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
+from jointctl.tools.session.loop_memory import FOREVER, LoopOrder, SharedBlock
 
 if TYPE_CHECKING:
     import can
 
 
-FOREVER = 1 << 62
 _POLL_S = 0.001
 
 
@@ -171,11 +170,6 @@ def warm_up_compiled_loop() -> None:
     os.close(block.fd)
 
 
-if __name__ == "__main__":
-    gc.disable()  # what a compiler leaves behind is little beside what it holds
-    warm_up_compiled_loop()
-
-
 # --- The loop on a serial line ---
 #
 # It is compiled, and not plain Python as for CAN adapters without a descriptor: a serial port is a descriptor that the
@@ -207,3 +201,8 @@ def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
             os.close(fd)
 
     yield ReadyLoop(go)
+
+
+if __name__ == "__main__":
+    gc.disable()  # what a compiler leaves behind is little beside what it holds
+    warm_up_compiled_loop()

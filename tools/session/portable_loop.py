@@ -48,10 +48,9 @@ from jointctl.firmware_py.cycle import Clock, Exchange, Histogram, run_cycles, s
 from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
 from jointctl.firmware_py.schema import INT32_MAX, new
 from jointctl.firmware_py.states import DriveRequest
-from jointctl.tools.session.loop_memory import SharedBlock, quantile_s
+from jointctl.tools.session.loop_memory import FOREVER, SharedBlock, quantile_s
 
 HIGHEST_RATE_HZ = 500.0
-FOREVER = 1 << 62
 PROBE_PERIOD_NS, PROBE_CYCLES = 2_000_000, 100
 _FRAMES_AT_ONCE = 256  # a flooded bus must not keep a cycle from its end
 _UNKNOWN_ERROR = 5  # EIO
