@@ -78,8 +78,3 @@ def marks_of(cls: type, mark: type[Mark]) -> dict[str, Mark]:
 def new(cls: type, count: int = 1) -> Any:
     """A zeroed record array of shape (count,); ``new(Sample)[0]`` is a mutable view of its first record."""
     return np.zeros(count, dtype_of(cls)).view(np.recarray)
-
-
-def view(cls: type, buffer: bytearray | memoryview | np.ndarray, count: int = 1, offset: int = 0) -> Any:
-    """A record array over existing memory (shared with another process)."""
-    return np.frombuffer(buffer, dtype_of(cls), count, offset).view(np.recarray)
