@@ -443,8 +443,8 @@ def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wan
     Also where virtual drives are asked for and the configuration has none.
     """
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
-    from jointctl.tools.verbs.demo import with_patience
-    from jointctl.tools.verbs.verb_options import each_joint, on_bus
+    from jointctl.tools.verbs.demo import each_joint, with_patience
+    from jointctl.tools.verbs.verb_options import on_bus
 
     options = observers(wanted.foxglove, wanted.ros2, allow_remote=wanted.allow_remote)
     config, shipped = _loaded(given, kind)

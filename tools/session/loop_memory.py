@@ -42,7 +42,7 @@ class SharedBlock:
     def __init__(self, fd: int, table_rows: int, port: type, axes: int = 1, links: int = 0) -> None:
         """Map an existing block; every process gives the same numbers and record of the drive's exchange."""
         self.fd = fd
-        self.table_rows, self.axes, self.axis = table_rows, axes, 0
+        self.axes, self.axis = axes, 0
         self.whole = self  # also seen from one axis
         self.allowed = set[int]()  # axes that may enable, so says their supervisor, who alone knows it
         self._offset = 0

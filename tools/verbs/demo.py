@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
-from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations, each_joint, on_bus
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations, on_bus
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
@@ -64,6 +66,13 @@ def _joint(path: Path) -> Config:
     if joint.virtual is None:
         raise ConfigurationError(f"{joint.path}: has no [virtual] section, so there is no virtual joint to move")
     return joint
+
+
+def each_joint(given: Config | ArmConfig, changed: Callable[[Config], Config]) -> Config | ArmConfig:
+    """A joint, or an arm of joints, that were changed."""
+    from jointctl.tools.configuration.config import Config
+
+    return changed(given) if isinstance(given, Config) else replace(given, joints=tuple(map(changed, given.joints)))
 
 
 def with_patience(config: Config) -> Config:

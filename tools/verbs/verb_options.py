@@ -150,13 +150,6 @@ def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config
     return on_bus(found, place(bus))
 
 
-def each_joint(given: Config | ArmConfig, changed: Callable[[Config], Config]) -> Config | ArmConfig:
-    """A joint, or an arm of joints, that were changed."""
-    from jointctl.tools.configuration.config import Config
-
-    return changed(given) if isinstance(given, Config) else replace(given, joints=tuple(map(changed, given.joints)))
-
-
 def on_bus(arm: Config | ArmConfig, given: GivenPlace, environ: Mapping[str, str] | None = None) -> Config | ArmConfig:
     """See `moved`; of an arm each of its joints is where the command line says, see `GivenPlace.of_bus`.
 
