@@ -1,13 +1,13 @@
 """Maps of a reducer from one slow motion both ways: kinematic error, eccentricity and torque ripple as Fourier series.
 
-Where the motor goes at constant speed, every whole motor turn gives one estimate: least squares of an offset, a slope
-and sines of 1 to HIGHEST periods a turn, of the difference of both encoders and of the torque.  The offset takes what
-hysteresis and friction do, the slope what changes slowly.  Where the joint swings instead of being held, its inertia
-and the slope of the friction against the speed have taken part of the torque, and the link's inertia has twisted the
-reducer: that is added.  The mean over the turns of both directions is the result.  What friction, hysteresis and
-counts do to one turn they do to the next in much the same way, so that the mean is not known better than one turn: the
-interval of 95 % has the spread of single turns, and that what was added is known to the shares STIFFNESS_ERROR,
-INERTIA_ERROR and FRICTION_ERROR.
+Where the motor goes at constant speed, every whole motor turn gives one estimate: least squares of an offset and sines
+of 1 to HIGHEST periods a turn, of the difference of both encoders and of the torque. The offset takes what hysteresis
+and friction do; what changes slowly, by the means of the turns before and after, is taken off. Where the joint swings
+instead of being held, its inertia and the slope of the friction against the speed have taken part of the torque, and
+the link's inertia has twisted the reducer: that is added. The mean over the turns of both directions is the result.
+What friction, hysteresis and counts do to one turn they do to the next in much the same way, so that the mean is not
+known better than one turn: the interval of 95 % has the spread of single turns, and that what was added is known to
+the shares STIFFNESS_ERROR, INERTIA_ERROR and FRICTION_ERROR.
 
     eps(theta) = sum a_k sin(k n theta + phi_k)    by which the link is ahead of the motor, both as their encoders read
     r(theta)   = sum c_k sin(k n theta + phi_k)    torque that the motor gets besides, positive towards positive angle
@@ -134,10 +134,27 @@ def _sines(angle_rad: np.ndarray, *values: np.ndarray) -> np.ndarray:
     """Complex amplitudes c of Im(c exp(i k angle)), k = 1..HIGHEST, of each of the values; shape (HIGHEST, values)."""
     orders = np.arange(1, HIGHEST + 1)
     waves = angle_rad[:, None] * orders
-    slope = (angle_rad - angle_rad.mean()) / math.tau
-    columns = np.hstack((np.ones((len(angle_rad), 1)), slope[:, None], np.sin(waves), np.cos(waves)))
+    columns = np.hstack((np.ones((len(angle_rad), 1)), np.sin(waves), np.cos(waves)))
     fitted = np.linalg.lstsq(columns, np.column_stack(values), rcond=None)[0]
-    return np.asarray(fitted[2 : 2 + HIGHEST] + 1j * fitted[2 + HIGHEST :])
+    return np.asarray(fitted[1 : 1 + HIGHEST] + 1j * fitted[1 + HIGHEST :])
+
+
+def _level(values: np.ndarray, turns: Sequence[tuple[int, slice]], index: int) -> np.ndarray:
+    """The values of a turn without their slope, which is that of the means of its neighbours in the same stroke.
+
+    Within one turn a slope is nearly a sum of the sines: what has more than HIGHEST periods would go into all of them.
+    """
+    direction, rows = turns[index]
+    first, last = rows, rows
+    for other, others in turns[max(index - 1, 0) : index + 2]:
+        if other == direction and others.stop == rows.start:
+            first = others
+        elif other == direction and others.start == rows.stop:
+            last = others
+    length = rows.stop - rows.start
+    apart = 0.5 * (last.start + last.stop - first.start - first.stop)
+    slope = (values[last].mean() - values[first].mean()) / apart if apart else 0.0
+    return np.asarray(values[rows] - slope * (np.arange(length) - 0.5 * length))
 
 
 def _waves(parts: np.ndarray, *errors: float) -> tuple[Wave, ...]:
@@ -188,12 +205,13 @@ def found_map(run: MapRun) -> FoundMap:
     speed = float(np.max(np.abs(run.desired_radps)))
     orders_radps = np.arange(1, HIGHEST + 1) * run.ratio * speed
     kinematic, ripple = [], []  # what is seen, and what the swing adds
-    for direction, rows in turns:
-        motor = run.motor_rad[rows]
-        link = motor if run.link_rad is None else run.link_rad[rows]
+    all_link = run.motor_rad if run.link_rad is None else run.link_rad
+    for index, (direction, rows) in enumerate(turns):
+        motor, link = run.motor_rad[rows], all_link[rows]
         # what the joint swings about its even motion: the angle itself is the abscissa, so that of time is taken
-        even = np.polynomial.Polynomial.fit(np.arange(len(motor)), motor, 1)(np.arange(len(motor)))
-        found = _sines(run.ratio * motor, link - motor, run.torque_Nm[rows], motor - even, link - even)
+        even = np.linspace(motor[0], motor[-1], len(motor))
+        levels = (_level(values, turns, index) for values in (all_link - run.motor_rad, run.torque_Nm))
+        found = _sines(run.ratio * motor, *levels, motor - even, link - even)
         # tau + r = friction + J q''; of a wave over the angle, q' = +-i w and q'' = -w^2 times it
         link_Nm = -(orders_radps**2) * run.link_kgm2 * found[:, 3]
         inertia_Nm = link_Nm - orders_radps**2 * run.motor_kgm2 * found[:, 2]

@@ -90,6 +90,21 @@ def test_the_interval_holds_what_friction_does_alike_to_every_turn_of_a_directio
     assert abs(found.amplitude - ERROR[4][0]) <= found.amplitude_half <= 0.02 * ERROR[4][0]
 
 
+def test_what_has_more_periods_than_are_looked_for_is_in_no_sine() -> None:
+    """A slope in each turn took it, and all sines made up for that slope: 0.7 of it once a turn."""
+    made = made_run(swing=0.0)
+    assert made.link_rad is not None
+    link_rad = made.link_rad + series({16: (1e-4, 1.0)}, made.motor_rad)
+    cogging_Nm = series({24: (0.5, 0.5)}, made.motor_rad)
+    found = found_map(replace(made, link_rad=link_rad, torque_Nm=made.torque_Nm - cogging_Nm))
+    for waves, true, floor in ((found.kinematic_rad, ERROR, 2e-6), (found.ripple_Nm, RIPPLE, 0.03)):
+        kept = found_of(waves)
+        assert {order: wave[0] for order, wave in kept.items() if order in true} == pytest.approx(
+            {order: size for order, (size, _) in true.items()}, abs=floor
+        )
+        assert all(kept[order][0] < 2.0 * floor for order in kept.keys() - true.keys())
+
+
 def test_a_sine_within_its_own_interval_is_no_part_of_the_map() -> None:
     """Of friction: it is there in one direction only, the same in every turn."""
     made = made_run()
