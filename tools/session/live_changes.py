@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, Gains, MotionChange, TrajectoryConstants
@@ -31,6 +31,7 @@ from jointctl.tools.configuration.sections import Section, Trajectory
 from jointctl.tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
 from jointctl.tools.session.display import Display, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import SharedBlock
+from jointctl.tools.session.plan import require_braking
 
 # --- Gains: the same gate as before enabling, on the whole way from the old ones to the new ---
 
@@ -113,7 +114,10 @@ def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> 
 
 
 def checked_motion(config: Config, record: TrajectoryConstants, table: np.ndarray) -> str:
-    """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
+    """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits.
+
+    Or where it could not be braked within them.
+    """
     peak = peak_of(record, table)
     ends = peak.position_min_rad, peak.position_max_rad
     moves = record.kind in (TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID)
@@ -127,6 +131,10 @@ def checked_motion(config: Config, record: TrajectoryConstants, table: np.ndarra
         )
     if problems:
         raise ConfigurationError(problems[0])
+    try:
+        require_braking(config, record, table)
+    except MotionFault as error:
+        raise ConfigurationError(error.message, error.hint) from None
     return motion_in_words(record, peak.velocity_radps)
 
 

@@ -15,6 +15,7 @@ import pytest
 
 import jointctl
 from jointctl import lockstep_joint
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py import slow_start
 from jointctl.firmware_py.slow_start import compiling
 from jointctl.firmware_py.states import AxisPhase
@@ -47,6 +48,17 @@ def streamed(joint: Joint, seconds: float, rate_Hz: float = RATE_Hz, *, velocity
         position_rad, velocity_radps = sine(0.05, 0.5, k / rate_Hz)
         joint.command(start_rad + position_rad, velocity_radps if velocity else None, time_s=k / rate_Hz, **more)
         joint.step(1.0 / rate_Hz)
+
+
+def test_a_move_that_could_not_be_braked_is_refused_and_the_program_goes_on() -> None:
+    """It was begun, and ended the program by REFERENCE_LIMIT."""
+    with jointctl.Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        joint.move_to(0.19)
+        with pytest.raises(ConfigurationError, match=r"would come to rest at .* sequence.brake_radps2 \(=2\)"):
+            joint.move_to(0.69, duration_s=0.95)
+        joint.move_to(0.69, duration_s=2.0)
+        assert joint.state.position_rad == pytest.approx(0.69, abs=1e-3)
 
 
 def test_it_is_commissioned_then_enabled_then_moves_and_is_off_afterwards() -> None:
