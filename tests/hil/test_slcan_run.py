@@ -27,7 +27,7 @@ class SlcanAdapter:
     """The firmware of a serial CAN adapter (Lawicel's ASCII protocol): C, O, L, S0..S8, V, N, t, T, r, R.
 
     `port` is what programs open: a link, so that it can be gone.  `opened` counts O commands, `rates` keeps the S
-    commands; frames pass while open.  `loose`: the port is gone once a program has closed the CAN channel.
+    commands; frames pass while open.  `loose`: who has opened the CAN channel is the last one that finds the port.
     """
 
     def __init__(self, channel: str, port: Path) -> None:
@@ -77,10 +77,10 @@ class SlcanAdapter:
         command = line[:1]
         if command in ("O", "L"):
             self._open, self.opened = True, self.opened + 1
-        elif command == "C":
-            if self._open and self.loose:
+            if self.loose:
                 self.loose = False
                 self._link.unlink()
+        elif command == "C":
             self._open = False
         elif command == "S":
             self.rates.append(line)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import time
+from pathlib import Path
 from typing import Any
 
 import can
 import pytest
 
-from jointctl.drivers.canopen.cia import SYNC_ID
+from jointctl.drivers import stop_note
+from jointctl.drivers.bus_lock import lock_name
+from jointctl.drivers.canopen.cia import SYNC_ID, ControlWord
 from jointctl.firmware_py.states import Fault
 from tests.hil.terminal import Terminal
 
@@ -42,6 +46,33 @@ def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
     assert not requests
     os.write(first.master, b"y\n")
     assert first.finished().code == 0, first.text
+    assert bench.disabled()
+
+
+@pytest.mark.parametrize("noted", [True, False])
+def test_frames_of_a_stop_that_was_not_heard_yet_are_its_own(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, noted: bool
+) -> None:
+    """On a busy computer it had ended as code 7, "another program controls this bus"; its twin does."""
+    config = bench.with_joint(trajectory__duration_s=60.0)
+    run = bench.start("run", config, "-y").saw("  tracking")
+    monkeypatch.setattr(stop_note, "FOLDER", Path("/dev/shm"))
+    lock = lock_name("jointctl", bench.channel)
+    try:
+        if noted:
+            stop_note.write_note(lock)
+        network = bench.network()
+        network.add_node(1).sdo.download(0x6040, 0, struct.pack("<H", ControlWord.DISABLE_VOLTAGE))
+        network.disconnect()
+        ended = run.finished(30.0)
+    finally:
+        for note in stop_note.FOLDER.glob(f"{lock}-stop-*"):
+            note.unlink()
+    if noted:
+        assert ended.code == 130, ended.err
+        assert "stopped by jointctl stop" in ended.out + ended.err
+    else:
+        ended.refused(7, "SDO request to node 1 that writes object 6040")
     assert bench.disabled()
 
 

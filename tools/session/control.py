@@ -257,6 +257,13 @@ def in_program(config: Config, output: Output, others: Sequence[Config] = ()) ->
         yield control
 
 
+def stop_has_come(signals: StopSignals, joints: Sequence[Config]) -> bool:
+    """Whether `jointctl stop` has: its frames may be seen before its word is heard, but its note is older than both."""
+    if any(stop_is_noted(*place) for place in _places(joints)):
+        signals.on_stop_command()
+    return signals.commanded_ns != 0
+
+
 def _places(joints: Sequence[Config]) -> list[tuple[str, str]]:
     """Interface and channel of each bus."""
     return list(dict.fromkeys((config.bus.interface, config.bus.channel) for config in joints))

@@ -34,7 +34,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import KeptRecords, histogram_times, summarise
-from jointctl.tools.session.control import Control
+from jointctl.tools.session.control import Control, stop_has_come
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text, read_off_text
 from jointctl.tools.session.loop_handle import LoopHandle
@@ -296,8 +296,7 @@ class Session:
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, watch, StopRequest.QUICK_STOP)
-            # `jointctl stop` sends such frames as well
-            if not signals.commanded_ns and not self._explained_by_restart(error, loop):
+            if not stop_has_come(signals, self.plan.configs) and not self._explained_by_restart(error, loop):
                 self._log_end(watches, error)
                 raise MotionFault(error.message, error.hint) from None
         except BaseException:
@@ -357,12 +356,13 @@ class Session:
 
     def _raise_what_others_did(self, watch: RunWatch, loop: LoopHandle) -> None:
         """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
-        if watch.around.signals.commanded_ns:
+        signals = watch.around.signals
+        if signals.commanded_ns:
             return
         try:
             watch.guard_settings(may_ask=False)  # an answer would come into the way of switching off
         except (DeviceError, BusError) as error:
-            if self._explained_by_restart(error, loop):
+            if stop_has_come(signals, self.plan.configs) or self._explained_by_restart(error, loop):
                 return
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, error.hint) from None
