@@ -41,9 +41,14 @@ def run(
 ) -> int:
     """Track the configured trajectory on a real or virtual joint, or with all joints of an arm."""
     return tracked(
-        config, output, assume_yes=assume_yes, dry_run=dry_run, allow_low_margin=allow_low_margin, scope=scope,
+        config,
+        output,
+        assume_yes=assume_yes,
+        dry_run=dry_run,
+        allow_low_margin=allow_low_margin,
+        scope=scope,
         live=live,
-    )  # fmt: skip
+    )
 
 
 def tracked(

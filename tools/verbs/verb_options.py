@@ -150,7 +150,9 @@ def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config
     return on_bus(found, place(bus))
 
 
-def on_bus(arm: Config | ArmConfig, given: GivenPlace, environ: Mapping[str, str] | None = None) -> Config | ArmConfig:
+def on_bus(
+    found: Config | ArmConfig, given: GivenPlace, environ: Mapping[str, str] | None = None
+) -> Config | ArmConfig:
     """See `moved`; of an arm each of its joints is where the command line says, see `GivenPlace.of_bus`.
 
     `UsageError` for what is one joint's alone, and for one channel where there are several buses that are not virtual.
@@ -158,25 +160,27 @@ def on_bus(arm: Config | ArmConfig, given: GivenPlace, environ: Mapping[str, str
     from jointctl.tools.configuration.config import Config, first_on_bus, raise_if
     from jointctl.tools.configuration.load import moved
 
-    if isinstance(arm, Config):
-        return moved(arm, given, environ)
+    if isinstance(found, Config):
+        return moved(found, given, environ)
     from jointctl.tools.configuration.arm import bus_problems
 
     if given.node is not None:
-        raise UsageError(f"--target (={given.node}) is one joint's, and {arm.path} is an arm", "give the joint's file")
-    buses = first_on_bus(arm.joints)
+        raise UsageError(
+            f"--target (={given.node}) is one joint's, and {found.path} is an arm", "give the joint's file"
+        )
+    buses = first_on_bus(found.joints)
     numbers = sorted(set(buses))
     joints = tuple(
-        moved(joint, given.of_bus(numbers.index(bus)), environ) for joint, bus in zip(arm.joints, buses, strict=True)
+        moved(joint, given.of_bus(numbers.index(bus)), environ) for joint, bus in zip(found.joints, buses, strict=True)
     )  # fmt: skip
     real = [joint.path for joint in joints if joint.bus.interface != "jointctl"]
     if given.channel is not None and len(numbers) > 1 and real:
         raise UsageError(
-            f"--channel (={given.channel}) names one bus, and the joints of {arm.path} are on {len(numbers)}",
+            f"--channel (={given.channel}) names one bus, and the joints of {found.path} are on {len(numbers)}",
             "bus.channel in the joints' files names them",
         )
-    raise_if([f"{arm.path}: {line}" for line in bus_problems(arm.arm, joints)])
-    return replace(arm, joints=joints)
+    raise_if([f"{found.path}: {line}" for line in bus_problems(found.arm, joints)])
+    return replace(found, joints=joints)
 
 
 # --- What the command line makes of an option besides ---
