@@ -175,8 +175,7 @@ def stop_node(
         remote = network.add_node(node, _standard_objects())
         remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
         objects = ObjectAccess(remote, "CiA 402")
-        times_s = braking_s or QUICK_STOP_S, off_s or OFF_S
-        switch_off = SwitchOff(network, node, objects, encoder_node, sleep, *times_s)
+        switch_off = SwitchOff(network, node, objects, encoder_node, sleep, braking_s or 0.0, off_s or 0.0)
         return switch_off.make_safe(brake_first=True)
     finally:
         with contextlib.suppress(Exception):  # what went wrong on it has been reported

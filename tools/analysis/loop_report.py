@@ -77,12 +77,12 @@ def not_modelled(config: Config) -> list[str]:
             f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
             "which takes margin that is not counted here"
         )
-    step_Nm, counts, cure = coarsest(config, loop_settings(config)[0])
+    step_Nm, counts, remedy = coarsest(config, loop_settings(config)[0])
     share = SOFT_STEP_SHARE if control.kind == "flexible_joint" else STEP_SHARE
     if step_Nm > share * config.limits.torque_max_Nm:
         found.append(
             f"{counts}: one count moves the torque by {text_Nm(step_Nm)}, more than {share:.0%} of "
-            f"limits.torque_max_Nm: it will chatter; {cure}"
+            f"limits.torque_max_Nm: it will chatter; {remedy}"
         )
     return found
 

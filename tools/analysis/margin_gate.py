@@ -226,13 +226,11 @@ def refuse_diverging_learning(found: Convergence | None) -> None:
         )
 
 
-def encoder_step_Nm(config: Config, settings: LoopSettings) -> float:
-    """By how much the law moves the torque, in that cycle, when an encoder counts one on; of two the greater one."""
-    return coarsest(config, settings)[0]
-
-
 def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
-    """(see `encoder_step_Nm`, the counts of that encoder by their key, what lowers the step)."""
+    """(step [Nm], the counts of that encoder by their key, what lowers it); of two encoders the one with the greater.
+
+    The step is by how much the law moves the torque, in that cycle, when the encoder counts one on.
+    """
     second, resolution_rad = config.joint_encoder, law_resolution_rad(config)
     own = f"encoder.counts_per_turn (={config.encoder.counts_per_turn})"
     law = own
@@ -240,8 +238,8 @@ def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
         law = f"joint_encoder.counts_per_turn (={second.counts_per_turn})"
     steps_Nm = np.abs(CONTROLLERS[settings.kind](settings).d[0])
     if settings.kind != ControllerKind.FLEXIBLE_JOINT:
-        cure = 'control.velocity_filter = "kalman" (of computed_torque_observer), or lower control.velocity_cutoff_Hz'
-        return float(np.max(steps_Nm) * resolution_rad), law, f"{cure}, kv and observer_radps"
+        remedy = 'control.velocity_filter = "kalman" (of computed_torque_observer), or lower control.velocity_cutoff_Hz'
+        return float(np.max(steps_Nm) * resolution_rad), law, f"{remedy}, kv and observer_radps"
     of_law = "lower control.observer_radps and velocity_cutoff_Hz"
     if settings.encoders == Encoders.BOTH:
         of_law = "lower control.observer_radps and link_cutoff_Hz"
@@ -253,7 +251,7 @@ def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
 
 def refuse_chatter(config: Config, settings: LoopSettings) -> None:
     """`MarginError` where the torque that moves the joint and one count on top of it reach the limit."""
-    (step_Nm, counts, cure), limit_Nm = coarsest(config, settings), config.limits.torque_max_Nm
+    (step_Nm, counts, remedy), limit_Nm = coarsest(config, settings), config.limits.torque_max_Nm
     holding_Nm = (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
     if holding_Nm >= limit_Nm:
         raise MarginError(
@@ -264,7 +262,7 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
         raise MarginError(
             f"the torque would chatter at its limit: one count of {counts} moves it by {text_Nm(step_Nm)}, friction "
             f"and gravity need {text_Nm(holding_Nm)}; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
-            f"an encoder with more counts, {cure}",
+            f"an encoder with more counts, {remedy}",
         )
 
 
@@ -466,23 +464,23 @@ def require_cascade(config: Config, delay_s: float, *, allow_low_margin: bool = 
                 f"drive.mode (={_section(config).mode}): the phase margin of the {loop.name} "
                 f"(={loop.phase_margin_deg:.1f} deg{'' if loop.stable else ', unstable'}) must be at least "
                 f"{minimum_deg:g} deg{f'; worst case: {loop.joint}' if loop.joint else ''}",
-                _cascade_cure(config, loop),
+                _cascade_remedy(config, loop),
             )
     return found
 
 
-def _cascade_cure(config: Config, loop: LoopMargin) -> str:
+def _cascade_remedy(config: Config, loop: LoopMargin) -> str:
     """What changes the margin of this loop."""
     cascade = cascade_of(config)
     if loop.name == TWIST:
         return f"a lower control.twist_radps (now {config.control.twist_radps:g})"
     if config.drive.own_loop() is not CommandKind.VELOCITY or loop.name != POSITION_LOOP:
         return "correct the gains in [drive.cascade], and those of the drive with its maker's software"
-    cure = f"a lower drive.cascade.position_gain_ps (now {cascade.position_gain_ps:g})"
+    remedy = f"a lower drive.cascade.position_gain_ps (now {cascade.position_gain_ps:g})"
     if cascade.velocity_gain_Nmspr is None or cascade.velocity_integral_Nmprad is None:
-        cure += "; or the drive's velocity_gain_Nmspr and velocity_integral_Nmprad: without both its velocity loop "
-        cure += "is taken for one that is infinitely quick"
-    return cure
+        remedy += "; or the drive's velocity_gain_Nmspr and velocity_integral_Nmprad: without both its velocity loop "
+        remedy += "is taken for one that is infinitely quick"
+    return remedy
 
 
 def cascade_text(config: Config, delay_s: float, *, allow_low_margin: bool = False) -> str:

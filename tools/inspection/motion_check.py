@@ -232,13 +232,13 @@ def check_run(config: Config, plan: CheckPlan) -> RunPlan:
 # --- what encoders and records of the check say about directions and scale ---
 
 SCALE_TOLERANCE = 0.001  # of the counts of a turn
-_SCALE_CURE = (
+_SCALE_REMEDY = (
     "encoder.counts_per_turn, encoder.side, joint.reduction_ratio; or the drive scales 6064 by 6091 and 6092: "
     "then turn the joint by hand by 90 deg with the power off and compare"
 )
 
-_SWAPPED_CURE = "swap encoder.counts_per_turn and joint_encoder.counts_per_turn if the makers' data agree"
-_PLUGS_CURE = "swap the cables of the two encoders, or which object of the drive each is read from"
+_SWAPPED_REMEDY = "swap encoder.counts_per_turn and joint_encoder.counts_per_turn if the makers' data agree"
+_PLUGS_REMEDY = "swap the cables of the two encoders, or which object of the drive each is read from"
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
@@ -271,8 +271,8 @@ def judged(config: Config, counts_per_motor_turn: float) -> Finding:
     shown = " or ".join(f"{factor:.4g}" for factor in factors)
     second = config.joint_encoder
     if second is not None and abs(second.counts_per_turn / counts_per_motor_turn - 1.0) < SCALE_TOLERANCE:
-        return Finding("counts", NOTE, f"{text}, and so says joint_encoder.counts_per_turn", _SWAPPED_CURE, numbers)
-    return Finding("counts", NOTE, f"{text}: {shown} times as many", _SCALE_CURE, numbers)
+        return Finding("counts", NOTE, f"{text}, and so says joint_encoder.counts_per_turn", _SWAPPED_REMEDY, numbers)
+    return Finding("counts", NOTE, f"{text}: {shown} times as many", _SCALE_REMEDY, numbers)
 
 
 @dataclass(frozen=True)
@@ -432,14 +432,14 @@ def _swapped(
     own, second = config.encoder.counts_per_turn, config.joint_encoder.counts_per_turn
     keys = f"encoder.counts_per_turn (={own}) and joint_encoder.counts_per_turn (={second})"
     own_of_joint = math.tau / abs(joint_rad_per_count(config))
-    for counts, what, cure in (
-        (own, keys, _SWAPPED_CURE),
-        (own_of_joint, "the readings of [encoder] and [joint_encoder]", _PLUGS_CURE),
+    for counts, what, remedy in (
+        (own, keys, _SWAPPED_REMEDY),
+        (own_of_joint, "the readings of [encoder] and [joint_encoder]", _PLUGS_REMEDY),
     ):
         expected = (second / counts) ** (2 if law == "joint_encoder" else -2)
         if abs(expected - 1.0) > SAME_SCALE and abs(abs(ratio) / expected - 1.0) <= tolerance:
             text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}], as if {what} were swapped"
-            yield Finding("scale", PROBLEM, text, cure, {"other_ratio": ratio})
+            yield Finding("scale", PROBLEM, text, remedy, {"other_ratio": ratio})
             return
 
 

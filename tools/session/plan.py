@@ -372,6 +372,10 @@ def require_approach(limits: Limits, axis: AxisConstants, table: np.ndarray, sta
 def require_braking(config: Config, trajectory: TrajectoryConstants, table: np.ndarray) -> None:
     """`MotionFault` where the trajectory, braked on the way, would come to rest beyond the limits: REFERENCE_LIMIT."""
     limits, brake_radps2 = config.limits, config.sequence.brake_radps2
+    low_rad, high_rad, speed_radps, _ = peak_of(trajectory, table)
+    way_rad = 0.5 * speed_radps**2 / brake_radps2
+    if limits.position_min_rad <= low_rad - way_rad and high_rad + way_rad <= limits.position_max_rad:
+        return  # wherever it is: most motions need not be looked at
     position_rad, velocity_radps = _on_the_way(trajectory, table)
     rest_rad = position_rad + 0.5 * velocity_radps * np.abs(velocity_radps) / brake_radps2
     beyond_rad = np.maximum(rest_rad - limits.position_max_rad, limits.position_min_rad - rest_rad)

@@ -17,7 +17,7 @@ from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import CONTROLLERS, loop_settings
 from jointctl.tools.analysis.loop_report import not_modelled
-from jointctl.tools.analysis.margin_gate import encoder_step_Nm, require_margin
+from jointctl.tools.analysis.margin_gate import coarsest, require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count
@@ -495,11 +495,11 @@ def test_the_step_of_a_count_is_that_of_position_rate_and_observer() -> None:
     precise = shipped("precise", encoder__counts_per_turn=2**17)
     slope_1ps = low_pass_gain(200.0, 1e-3) * 1000.0
     expected = 2.1 * (3600.0 + (120.0 + 60.0) * slope_1ps) * math.tau / 2**17
-    assert encoder_step_Nm(precise, loop_settings(precise)[0]) == pytest.approx(expected)
+    assert coarsest(precise, loop_settings(precise)[0])[0] == pytest.approx(expected)
     two = shipped("realistic", joint_encoder__counts_per_turn=2**24)  # the motor's encoder is the coarser one
     loop, _ = loop_settings(two)
     slope_1ps = low_pass_gain(loop.cutoff_Hz, 1e-3) * 1000.0
     kept = math.exp(-loop.twist_radps * 1e-3)
     of_motor = loop.inertia_kgm2 * (loop.kp * kept + loop.kv * slope_1ps)
     of_motor += loop.observer_radps * loop.motor_inertia_kgm2 * slope_1ps
-    assert encoder_step_Nm(two, loop) == pytest.approx(of_motor * abs(joint_rad_per_count(two)))
+    assert coarsest(two, loop)[0] == pytest.approx(of_motor * abs(joint_rad_per_count(two)))
