@@ -21,9 +21,10 @@ which no margin shows, and its wide intervals are those of friction that looks l
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -247,7 +248,11 @@ class Judged:
     noise_Nm: float
     gate_deg: float  # least phase margin of the joints of the gate
     gate_sensitivity: float  # and their largest |S|
-    settling_s: float  # slowest mode of the joint as it is believed
+    believed: Array = field(compare=False, repr=False)  # closed loop of the joint as it is believed, (states, states)
+
+    @functools.cached_property
+    def settling_s(self) -> float:  # of its slowest mode
+        return -self.settings.period_s / math.log(np.max(np.abs(poles_of(self.believed))))
 
     @property
     def stable(self) -> bool:
@@ -293,12 +298,9 @@ class ChosenGains:
     goals: Goals
     control: Control
 
-    def missed_by(self, one: Judged) -> dict[str, float]:
-        return self.goals.missed(one)
-
     def allows(self, one: Judged) -> bool:
         """Whether it could have been chosen: every goal is met, and the observer is no quicker than the law bears."""
-        return not self.missed_by(one) and self.law.beyond(one.settings) == 0.0
+        return not self.goals.missed(one) and self.law.beyond(one.settings) == 0.0
 
     def with_gains(self, one: Judged) -> Control:
         """[control] with the gains of another choice."""
@@ -375,14 +377,13 @@ class _Search:
         period_s = self.nominal.period_s
         self._omega = _frequencies_radps(config, period_s)
         self._z = np.exp(1j * self._omega * period_s)
-        # the late end of delay and lag for all of them
-        late_s = latest_s(settings, intervals)
+        late_s = latest_s(settings, intervals)  # for all of them
         within = joints_within(config, intervals)
         joints = [sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders) for joint in within]
         self._of_goals = len(joints)
         # the link is what is to be where it should be, whichever encoder the law reads
-        link = sampled_joint(period_s, late_s, settings.lag_s, within[0], Encoders.BOTH).response(self._z)
-        self._link = link[:, 0, 0]
+        link = sampled_joint(period_s, late_s, settings.lag_s, within[0], Encoders.BOTH)
+        self._link = link.response(self._z)[:, 0, 0]
         joints += [linear_loop(case).joint for case in cases(settings)]
         lossless = lossless_joints(config)
         large = steady_joints(config) + lossless
@@ -392,7 +393,7 @@ class _Search:
         self._eased = np.ones(len(joints))
         if settings.encoders == Encoders.LINK:
             self._eased[len(joints) - len(lossless) :] = EASED
-        self._responses = np.array([joint.response(self._z) for joint in joints])
+        self._responses = np.array([joint.response(self._z)[..., 0] for joint in joints])
         plants = [joint.state_space() for joint in joints]
         sizes = [len(plant.a) for plant in plants]  # by their delay
         self._believed = plants[0]
@@ -405,24 +406,23 @@ class _Search:
         self._count_rad = np.array(counts if two else counts[:1])
 
     def judged(self, logarithms: Array) -> Judged:
-        settings = self.law.settings(self.nominal, logarithms)
-        found = self._judge(settings)
-        self.tried.append(found)
-        return found
+        self.tried.append(self._judge(self.law.settings(self.nominal, logarithms)))
+        return self.tried[-1]
 
     def _judge(self, settings: LoopSettings) -> Judged:
         controller = linear_loop(settings).controller
+        believed = closed_loop(self._believed, controller)
         loops = [closed_loop(plants, controller) for plants in self._plants]
         if not all(come_to_rest(alike) for alike in loops):
             worst = max(float(np.max(np.abs(poles_of(alike)))) for alike in loops)
             if worst >= 1.0:
-                return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, math.inf)
+                return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, believed)
         law = controller.response(self._z)
-        phases, gains, peaks = margins_on_grid(-(law @ self._responses)[:, :, 0, 0])
+        open_loops = -np.einsum("fe,jfe->jf", law[:, 0], self._responses)  # joints, frequencies, encoders
+        phases, gains, peaks = margins_on_grid(open_loops)
         phases, peaks = phases * self._eased, peaks / self._eased
         own, gate = slice(self._of_goals), slice(self._of_goals, None)
-        response = self._responses[0]
-        sensitivity = 1.0 / (1.0 - (law @ response)[:, 0, 0])
+        sensitivity = 1.0 / (1.0 + open_loops[0])
         error = self._link * sensitivity * np.hypot(1.0 / self._omega, 1.0 / self.law.ripple_radps)
         noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
         return Judged(
@@ -430,7 +430,7 @@ class _Search:
             float(np.min(phases[own])), float(np.min(gains[own])), float(np.max(peaks[own])),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
             float(np.min(phases[gate], initial=90.0)), float(np.max(peaks[gate], initial=1.0)),
-            -settings.period_s / math.log(np.max(np.abs(poles_of(closed_loop(self._believed, controller))))),
+            believed,
         )  # fmt: skip
 
 

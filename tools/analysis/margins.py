@@ -227,19 +227,20 @@ def margins_on_grid(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
     Between two frequencies L is taken as straight: they are to be close enough.
     """
 
-    def crossed(values: Array) -> tuple[ComplexArray, NDArray[np.bool_]]:
-        """L between two frequencies where `values` goes through zero, and where it does."""
-        before, after = values[:, :-1], values[:, 1:]
-        crosses = (before > 0.0) != (after > 0.0)
-        share = before / np.where(crosses, before - after, 1.0)
-        return (1.0 - share) * open_loop[:, :-1] + share * open_loop[:, 1:], crosses
+    def crossed(values: Array) -> tuple[NDArray[np.intp], ComplexArray]:
+        """The rows in which `values` goes through zero between two frequencies, and L there."""
+        positive = values > 0.0
+        rows, at = np.nonzero(positive[:, :-1] != positive[:, 1:])
+        before, after = values[rows, at], values[rows, at + 1]
+        share = before / (before - after)
+        return rows, (1.0 - share) * open_loop[rows, at] + share * open_loop[rows, at + 1]
 
-    at_one, crosses = crossed(np.log(np.abs(open_loop)))
-    phase = np.degrees(np.min(np.abs(np.angle(-at_one)), axis=1, where=crosses, initial=math.pi))
-    real, crosses = crossed(open_loop.imag)
-    size = np.abs(real.real)
-    crosses &= real.real < 0.0
-    gain = np.min(np.maximum(size, 1.0 / np.where(crosses, size, 1.0)), axis=1, where=crosses, initial=math.inf)
+    phase, gain = np.full(len(open_loop), 180.0), np.full(len(open_loop), math.inf)
+    rows, at_one = crossed(np.log(np.abs(open_loop)))
+    np.minimum.at(phase, rows, np.degrees(np.abs(np.angle(-at_one))))
+    rows, real = crossed(open_loop.imag)
+    rows, size = rows[real.real < 0.0], -real.real[real.real < 0.0]
+    np.minimum.at(gain, rows, np.maximum(size, 1.0 / size))
     return phase, gain, np.max(1.0 / np.abs(1.0 + open_loop), axis=1)
 
 

@@ -554,7 +554,7 @@ class Tune:
         """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
         gains = self.gains or self.chosen_gains(self.options.law, self.options.objective)
         error = self.state["verification"]["after"]["rmse_mrad"]
-        allowed = [one for one in gains.tried if one.stable and not gains.missed_by(one)]
+        allowed = [one for one in gains.tried if one.stable and not gains.goals.missed(one)]
         tried, runs = [gains.best], list[dict[str, Any]]()
         for one in sorted(allowed, key=lambda one: one.error):
             if len(runs) == REFINE_RUNS:
