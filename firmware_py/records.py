@@ -406,6 +406,7 @@ class SequenceConstants:  # times of the run's phases
     release_s: f8  # torque ramp to zero at standstill
     settle_cycles: i8  # consecutive good samples before enabling
     wait_max_cycles: i8  # without good samples, or without a sign of life of the supervisor
+    begin_max_cycles: i8  # until the drive has left "off" on its way to enabled
     enable_max_cycles: i8
     stop_max_cycles: i8
     off_max_cycles: i8

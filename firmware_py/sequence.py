@@ -160,13 +160,16 @@ def step_enabling(
     """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start.
 
     A joint of an arm waits until `all_prepared`, then until `all_enabled`; one that never is ends the run of all.  So
-    does a drive that falls back to off: an STO that is closed again must not begin a motion.
+    does a drive that falls back to off, or stays there: an STO that is closed then must not begin a motion.
     """
     drive = sample.drive_state
     if drive == DriveState.STARTING or drive == DriveState.PREPARED or drive == DriveState.ENABLED:
         state.began = 1
     elif drive == DriveState.OFF and state.began != 0:
         trip(state, Fault.DRIVE_NOT_ENABLED, float(sample.status_word), sample.drive_error)
+        return
+    if state.began == 0 and waited_too_long(state, constants.sequence.begin_max_cycles):
+        trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
         return
     if sample.drive_state != DriveState.ENABLED:
         state.stood_rad = state.measured_position_rad

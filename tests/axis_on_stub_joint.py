@@ -82,6 +82,7 @@ def small_axis_constants() -> Any:
     sequence = axis.sequence
     sequence.approach_s, sequence.brake_radps2, sequence.release_s = 0.2, 20.0, 0.01
     sequence.settle_cycles, sequence.wait_max_cycles, sequence.enable_max_cycles = 4, 40, 30
+    sequence.begin_max_cycles = 30
     sequence.stop_max_cycles, sequence.off_max_cycles, sequence.supervisor_max_cycles = 100, 20, 10
     sequence.may_enable = 1
     return constants

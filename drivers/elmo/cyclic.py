@@ -119,6 +119,7 @@ class ElmoPort:
     unit_mode: i4  # of the last status that is believed; 0 = none yet
     odd_modes: i4  # status replies in a row with another unit mode than that of the run
     has_been_on: i4  # 1: MO=1 has done its work; it is never said again
+    denied: i4  # 1: MO=1 was refused; it is not said again, a motion must not begin because STO is closed
     enable_wait_cycles: i8
     no_sample_cycles: i8
     no_status_cycles: i8
@@ -319,6 +320,7 @@ def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
     length = port.line_length - start
     if length >= 1 and length <= 2 and port.line[port.line_length - 1] == QUESTION_MARK:
         port.refused += 1
+        port.denied |= int(question == Question.MO)
         return False
     return _take_value(port, sample, question, start, now_ns, slot)
 
@@ -507,8 +509,8 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
         if port.status & SERVO_ON != 0:
             heard = port.no_sample_cycles <= port.dead_man_cycles
             _put_target(port, command, heard and sample.drive_state == DriveState.ENABLED)
-        elif port.has_been_on != 0 or port.fault_seen > 0:
-            pass  # the drive switched itself off: never on again without the user
+        elif port.has_been_on != 0 or port.denied != 0 or port.fault_seen > 0:
+            pass  # the drive switched itself off, or refused: never on again without the user
         elif port.unit_mode == 0 or sample.restarts != 0:
             pass  # its unit mode is not known, or not the one that it was commissioned for
         elif port.enable_wait_cycles == 0:

@@ -106,6 +106,7 @@ class CanopenSection(DriveSection):
 
     simulated: ClassVar[bool] = True
     sends_frames: ClassVar[bool] = True
+    begins_within_s: ClassVar[float] = 0.5  # to Ready To Switch On, which applies no power
     when_the_loop_ends: ClassVar[str] = (
         "its heartbeat on the bus has ended with it, so the drive stops the joint by itself"
     )

@@ -7,6 +7,7 @@ A drive is a plug-in of four parts, each behind a table of its kinds: its sectio
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -63,6 +64,7 @@ class DriveSection(Section, ABC):
 
     simulated: ClassVar[bool] = False  # its joint can be simulated faster than real time
     sends_frames: ClassVar[bool] = False  # on a CAN bus that others can listen to
+    begins_within_s: ClassVar[float] = math.inf  # it leaves "off" once it is asked to enable, or will not at all
     when_the_loop_ends: ClassVar[str]  # by accident: what becomes of the joint
     torque_source: ClassVar[str]  # for a sweep's data: which reading the torque comes from
 

@@ -399,6 +399,7 @@ def _fill_sequence(
     record.settle_cycles = _cycles(config, sequence.settle_s)
     record.wait_max_cycles = _cycles(config, sequence.wait_timeout_s)
     record.enable_max_cycles = _cycles(config, sequence.enable_timeout_s)
+    record.begin_max_cycles = _cycles(config, min(sequence.enable_timeout_s, config.drive.begins_within_s))
     record.stop_max_cycles = _cycles(config, sequence.stop_timeout_s)
     record.off_max_cycles = _cycles(config, sequence.off_timeout_s)
     record.may_enable = 1

@@ -182,6 +182,7 @@ from tests.unit.firmware_py import stub_loop as stub
 
 loop = stub.Loop(small_axis_constants(), period_ns=10_000)
 sequence = loop.constants[0].sequence
+sequence.begin_max_cycles = 1 << 40
 sequence.wait_max_cycles = sequence.enable_max_cycles = 1 << 40  # of 10 us: a busy computer uses up 30 at once
 sequence.approach_s = 0.01
 

@@ -35,7 +35,7 @@ from jointctl.drivers.elmo.exchange import link_of, receive
 from jointctl.firmware_py.records import LINE_GONE, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
-from jointctl.hil.elmo_drive import switch_off
+from jointctl.hil.elmo_drive import AMPLIFIER_NOT_READY, switch_off
 from tests.unit.drivers.elmo.virtual_line import PER_RAD, PERIOD_S, RAMP_CPS2, Talk
 
 
@@ -260,6 +260,21 @@ class TestFaultsOfTheDrive:
         talk.device.amplifier = 3
         talk.cycle(count=14)
         assert (talk.sample.drive_state, talk.sample.drive_error) == (DriveState.FAULT, 0)
+
+    @pytest.mark.parametrize(("changed", "on"), [(False, 0), (True, 1)])
+    def test_a_drive_that_refuses_is_not_asked_again_and_its_twin_whose_line_changed_it_is(
+        self, talk: Talk, changed: bool, on: int
+    ) -> None:
+        """Its STO is open, say, and no bit of SR shows that: what is closed later begins no motion."""
+        talk.cycle(DriveRequest.OFF, count=4)
+        switch_on = talk.device.execute
+        talk.device.execute = lambda line: (  # type: ignore[method-assign]
+            switch_on(line) if line != b"MO=1" else b";" if changed else bytes([AMPLIFIER_NOT_READY]) + b"?;"
+        )
+        talk.cycle()
+        talk.device.execute = switch_on  # type: ignore[method-assign]
+        talk.cycle(count=3 * int(talk.port.enable_retry_cycles))
+        assert (talk.device.m.motor_on, talk.port.refused) == (on, int(not changed))
 
     def test_a_motor_that_is_switched_off_by_others_stays_off(self, talk: Talk) -> None:
         talk.enabled()

@@ -321,6 +321,24 @@ def test_enable_timeout(axis: Any, state: Any, phase_cycle: int, fault: Fault) -
     assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
 
 
+@pytest.mark.parametrize("late_cycles", [0, 1])
+@pytest.mark.parametrize("before", [DriveState.OFF, DriveState.UNKNOWN])
+def test_a_drive_that_does_not_even_begin_is_asked_for_a_short_time_only(
+    axis: Any, state: Any, before: DriveState, late_cycles: int
+) -> None:
+    """Its STO is open, say: a motion would begin by itself when somebody closes the guard."""
+    axis.sequence.begin_max_cycles = 5
+    settled(state)
+    state.phase, state.phase_cycle = AxisPhase.ENABLING, 5 + late_cycles
+    for drive_state in (before, DriveState.STARTING, DriveState.PREPARED, DriveState.ENABLED):
+        if state.phase == AxisPhase.ENABLING:
+            step_enabling(axis, state, sample_of(drive_state), axis_table(), True, True)
+            state.phase_cycle += 10  # one that has begun has `enable_max_cycles`
+    assert (state.phase, state.fault) == (
+        (AxisPhase.DISABLING, Fault.ENABLE_TIMEOUT) if late_cycles else (AxisPhase.APPROACH, Fault.NONE)
+    )
+
+
 @pytest.mark.parametrize("phase", AxisPhase)
 @pytest.mark.parametrize("apart_rad", [-0.0101, -0.0099, 0.0099, 0.0101])
 def test_two_encoders_are_compared_until_the_drive_brakes(
