@@ -332,8 +332,8 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
 
 def _start_buses(stack: ExitStack, configs: Iterable[Config], timing: bool) -> None:
     for config in configs:
-        path = default_socket_path(config.bus.channel)
         try:
+            path = default_socket_path(config.bus.channel)
             stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
         except VirtualBusError as error:
             raise BusError(str(error)) from None

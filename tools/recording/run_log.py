@@ -492,6 +492,7 @@ class RunLogWriter(AbstractContextManager["RunLogWriter"]):
 
 
 MESSAGE_BYTES = dtype_of(LogRecord).itemsize + 65  # of the log file for a record, its share of the joint states in it
+CLOCKS_APART_S = 10.0  # of a file server and this computer
 UNKNOWN_S = 60.0  # room for a run until it is stopped
 
 
@@ -530,7 +531,8 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     """Keep the newest `log.keep` runs of this configuration, `path` counted as one; returns what was removed.
 
     A run is its log with the pictures and pages beside it, by name; nothing else in the folder is touched.  Of an arm
-    the logs of each joint count by themselves.
+    the logs of each joint count by themselves.  None is removed while one is of a time that is still to come: the
+    calendar clock was set back, and what looks oldest may be the newest.
     """
     if not config.log.keep or not path.parent.is_dir():
         return []
@@ -543,7 +545,10 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     for file in path.parent.iterdir():
         if (found := name.fullmatch(file.name)) and found[1] != path.stem:
             runs.setdefault(found[1], []).append(file)
-    oldest_first = sorted(runs, key=lambda run: max(file.stat().st_mtime for file in runs[run]))
+    ended_s = {run: max(file.stat().st_mtime for file in files) for run, files in runs.items()}
+    if max(ended_s.values(), default=0.0) > time.time() + CLOCKS_APART_S:
+        return []
+    oldest_first = sorted(runs, key=ended_s.__getitem__)
     removed = [file for run in oldest_first[: max(0, len(runs) + 1 - config.log.keep)] for file in runs[run]]
     for file in removed:
         file.unlink()

@@ -241,6 +241,7 @@ READING = ("scan", "info", "monitor")
         ("demo --config joint.toml", {"virtual": None}, 3, ["[virtual]"]),
         ("report .", {}, 8, [".: is a folder, not a file"]),
         ("validate joint.toml /", {}, 8, ["/: is a folder, not a file"]),
+        ("hil joint.toml", {"bus__channel": "/tmp/a_bus"}, 4, ["channel (='/tmp/a_bus') must consist of letters"]),
         ("hil joint.toml", {"drive__eds": "poor.eds"}, 3, ["poor.eds", "describes no object"]),
         *((verb, {}, 3, ["which bus", "-i socketcan -c can0"]) for verb in READING),
         *((f"{verb} -i jointctl -c nobody-here -t 1", {}, 4, ["no virtual bus"]) for verb in READING),

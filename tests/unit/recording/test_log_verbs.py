@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from io import StringIO
@@ -105,6 +106,18 @@ def test_only_the_newest_runs_are_kept_with_the_new_one(
         f"virtual-2026010{i}-120000{end}" for i in range(4 - left, 4) for end in (".mcap", ".png", ".tail.mcap")
     ]
     assert names(tmp_path) == sorted(expected)
+
+
+@pytest.mark.parametrize(("ahead_s", "left"), [(5.0, 3), (60.0, 15)])
+def test_none_is_removed_after_the_clock_was_set_back(
+    in_folder: Callable[..., Config], tmp_path: Path, ahead_s: float, left: int
+) -> None:
+    """The runs since then looked older than those before, and the newest were removed."""
+    aged(tmp_path, 5)
+    os.utime(tmp_path / "virtual-20260100-120000.mcap", (time.time() + ahead_s, time.time() + ahead_s))
+    config = in_folder(keep=2)
+    remove_oldest(config, log_path(config))
+    assert len(names(tmp_path)) == left
 
 
 def test_files_that_are_not_runs_of_this_configuration_stay(in_folder: Callable[..., Config], tmp_path: Path) -> None:
