@@ -18,14 +18,18 @@ import pytest
 
 from jointctl.drivers.canopen import watchdog
 from jointctl.drivers.canopen.cia import Mode
-from jointctl.drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError, MotionFault
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.faults import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.sections import FAULT_KINDS
-from jointctl.tools.session.control import Control, StopSignals
+from jointctl.tools.session import control as session_control
+from jointctl.tools.session import session as session_module
+from jointctl.tools.session.control import STOOD_S, Control, StopSignals
 from jointctl.tools.session.display import OnlyShows, Snapshot
+from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.virtual_joint import fault_constants
 from tests.configurations import written
@@ -218,6 +222,43 @@ def test_one_yes_is_not_for_a_drive_that_takes_the_place_of_the_first(tmp_path: 
                 assert session.run() is not None
             assert session.drive_state in OFF
     assert (tmp_path / "1.mcap").exists() is not swapped  # nothing has moved
+
+
+def test_the_question_comes_when_the_loop_is_ready_to_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loop that compiled for minutes moved the joint so long after the yes."""
+    config, said = short(tmp_path, "virtual"), list[str]()
+    wait_ready = LoopHandle.wait_ready
+
+    def waited(loop: LoopHandle, *how: Any) -> None:
+        wait_ready(loop, *how)
+        said.append("ready")
+
+    monkeypatch.setattr(LoopHandle, "wait_ready", waited)
+    monkeypatch.setattr(TerminalConsent, "agreed", lambda *_: bool(said.append("asked")))
+    with real_time_joint(config):
+        assert session_of(config, tmp_path / "run.mcap", allow_low_margin=True).run() is None
+    assert said == ["ready", "asked"]
+
+
+@pytest.mark.parametrize("hung_s", [31, 29])
+def test_a_yes_does_not_outlast_a_log_folder_that_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hung_s: int
+) -> None:
+    now_ns, late, control = session_control.now_ns, [0], Control(StopSignals())
+    monkeypatch.setattr(session_control, "now_ns", lambda: now_ns() + late[0])
+
+    def hang(*_: object) -> None:
+        for _s in range(hung_s):
+            late[0] += 10**9
+            control.signals.note_standstill()  # as its thread does once a second
+
+    monkeypatch.setattr(session_module, "prepare_log", hang)
+    config = short(tmp_path, "virtual")
+    session = session_of(config, tmp_path / "run.mcap", control=control, allow_low_margin=True)
+    refused = pytest.raises(MotionFault, match="after the motion was agreed to")
+    with real_time_joint(config), refused if hung_s > STOOD_S else nullcontext():
+        assert session.run() is not None
+    assert session.drive_state in OFF
 
 
 # --- the configuration ---

@@ -303,15 +303,15 @@ def test_a_program_whose_process_becomes_another_one_leaves_the_joint_and_its_bu
 
 
 STANDS = """
-from jointctl.tools.session import control, loop_handle
+from jointctl.tools.session import control
 
-wait_ready, now_ns = loop_handle.LoopHandle.wait_ready, control.now_ns
+agreed, now_ns = control.StopSignals.agreed, control.now_ns
 
-def standing(loop, *arguments):
+def standing(signals):
+    agreed(signals)
     control.now_ns = lambda: now_ns() + {stood_s} * 10**9
-    wait_ready(loop, *arguments)
 
-loop_handle.LoopHandle.wait_ready = standing
+control.StopSignals.agreed = standing
 """
 
 

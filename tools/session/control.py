@@ -48,6 +48,7 @@ class StopSignals:
         self._again = False  # the next signal is no new one
         self.looked_ns: int | None = None  # by `now_ns`; from the user's yes on, which may be for several motions
         self.stood_s = 0.0  # since then, if it was long
+        self.agreed_ns = 0  # to the motion that is about to begin
         self.drives: list[str] = []  # those that answered first, `DriveIdentity.text` of each
         self._command = threading.Lock()
 
@@ -101,8 +102,15 @@ class StopSignals:
         self.look()
 
     def agreed(self) -> None:
-        """The user has said yes."""
-        self.looked_ns = self.looked_ns or now_ns()
+        """The user has said yes to this motion, or before to all of a command."""
+        self.agreed_ns = now_ns()
+        self.looked_ns = self.looked_ns or self.agreed_ns
+
+    def begin(self) -> None:
+        """As `look`, just before a loop is let go: also where this program has waited since the yes, as for a disk."""
+        if (waited_s := (now_ns() - self.agreed_ns) * 1e-9) > STOOD_S:
+            self.stood_s = waited_s
+        self.look()
 
     def look(self) -> None:
         """`MotionFault` where a yes is out of date: who goes on after a standstill moves when no one expects it."""

@@ -129,15 +129,15 @@ class Session:
                     return None
                 signals.require_same([report.identity for report in reports])
                 signals.leave_if_asked()
-                placed = self._ask(lambda: self._allowed(reports))
+                placed = self._ask(lambda: self._possible(reports))
                 if placed is None:
                     return None
-                signals.agreed()
                 loop.wait_ready(signals.leave_if_asked, self._output.note)
-                signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
-                    signals.look()  # which may have taken its time
+                if not self._ask(lambda: self._agreed(placed)):
+                    return None
+                signals.leave_if_asked()
                 around = {axis: Around(signals, *watchers, guard) for axis, watchers in looking_on.items()}
                 return self._supervise(drives, loop, reports, placed, around)
             except (BusError, DeviceError, NoDeviceError):
@@ -205,8 +205,8 @@ class Session:
         brake = self._consent.brake
         return None if brake is None else lambda text: self._ask(lambda: brake(text))
 
-    def _allowed(self, reports: Sequence[CommissioningReport]) -> Placed | None:
-        """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be.
+    def _possible(self, reports: Sequence[CommissioningReport]) -> Placed | None:
+        """The motion from where the joint stands, shown and possible; None if it is only shown.
 
         Of an arm those of all joints: one that cannot begin keeps all of them from it.
         """
@@ -221,11 +221,16 @@ class Session:
             with blamed(joint.name):
                 require_ready(joint.config, report, joint.log_path)
                 joint.motion.require_start(report.start_position_rad)
+        return placed
+
+    def _agreed(self, placed: Placed) -> bool:
+        """Asked once all is ready: a loop may compile for minutes, and would move the joint long after the yes."""
         if not self._consent.agreed(placed.lines):
-            return None
+            return False
+        self.signals.agreed()
         for joint in self._joints:
             prepare_log(joint.config, joint.log_path, self._output)
-        return placed
+        return True
 
     def _supervise(
         self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
@@ -281,7 +286,7 @@ class Session:
         for drive, each in zip(drives.drives, watches, strict=True):
             each.temperature = TemperatureWatch(drive.thermometer(), each.log, each.loop.block.constants[0].law)
             each.settings_guard = drive.settings_guard()
-        signals.look()
+        signals.begin()
         started_ns = time.monotonic_ns()
         loop.go(constants, drives.port())
         try:

@@ -764,7 +764,9 @@ def test_what_run_checks_is_checked_before_start(
 
         def run(self) -> None:
             self.drive_state = "switch on disabled"
-            self._allowed([CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)])
+            placed = self._possible([CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)])
+            assert placed is not None
+            self._agreed(placed)
 
     monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
     monkeypatch.setattr(session_module, "require_ready", require_ready)

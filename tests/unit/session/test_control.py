@@ -125,6 +125,22 @@ def test_one_yes_for_several_motions_is_out_of_date_after_a_standstill_between_t
         signals.leave_if_asked()
 
 
+@pytest.mark.parametrize(("waited_s", "refused"), [(31, True), (29, False)])
+def test_a_yes_is_out_of_date_where_a_disk_has_hung_before_the_motion(
+    monkeypatch: pytest.MonkeyPatch, waited_s: int, refused: bool
+) -> None:
+    """The thread that looks on went on: no standstill of the program, and the joint moved when the folder came back."""
+    signals, clock = StopSignals(), SimpleNamespace(s=1000)
+    monkeypatch.setattr(control, "now_ns", lambda: clock.s * 10**9)
+    signals.agreed()
+    for _ in range(waited_s):
+        clock.s += 1
+        signals.note_standstill()
+    signals.leave_if_asked()
+    with pytest.raises(MotionFault, match="stood still for 31 s") if refused else nullcontext():
+        signals.begin()
+
+
 def test_a_command_is_looked_on_between_its_motions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(control, "LOOK_S", 1e-3)
     config = load_config(written(tmp_path / "joint.toml", bus__channel="nobodys"))
