@@ -16,7 +16,13 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 
 from jointctl.drivers.drive import Drive
-from jointctl.drivers.elmo.dialogue import SERVO_ON, motor_fault_text, usb_serial_number
+from jointctl.drivers.elmo.dialogue import (
+    AMPLIFIER_MASK,
+    SERVO_ON,
+    motor_fault_text,
+    motor_off_cause,
+    usb_serial_number,
+)
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import command_time_s
 from jointctl.drivers.errors import BusError, JointctlError
@@ -72,8 +78,9 @@ class ElmoSession(SessionDrive):
         text = serial_fault_text(fault, value) or fault_text(fault, value, 0)
         finite = math.isfinite(value)
         happened = text.happened.format(value=value, word=f"{round(value):X}h") if finite else text.happened
-        if drive_error:
-            happened += f"; the drive says {motor_fault_text(drive_error)}"
+        status = round(value) if finite and fault is Fault.DRIVE_FAULT else 0
+        if drive_error or status & AMPLIFIER_MASK:
+            happened += f"; the drive says {motor_off_cause(status, drive_error)}"
         return FaultText(happened, text.cause, text.next_step)
 
     def error_text(self, code: int) -> str:

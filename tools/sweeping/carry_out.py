@@ -431,6 +431,8 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
             return broken_off(session.drive_state, output, control.signals.by_command)
     if result is None:
         return never_begun(session.drive_state, output, dry_run=dry_run)
+    if (result.fault_text is not None or result.stopped_by) and not result.log_lost:
+        output.note(f"log: {result.log_path}")
     require_off(session.drive_state)
     if result.fault_text is not None:
         raise _ended(result.fault, result.fault_text, what)

@@ -127,6 +127,8 @@ class Carrier:
         """The records; `MotionFault` after any other fault than these, `NotCarriedOut` where it was not begun."""
         carried = self._simulated(config, motion) if self.control is None else self._moved(config, motion, title)
         if carried.text is not None and carried.fault not in also_faults:
+            if carried.log:
+                self.output.note(f"log: {carried.log}")
             raise _ended(title, carried)
         return carried
 

@@ -29,7 +29,7 @@ from jointctl.tools.session import result as run_report
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import OVERRUN_CYCLES, EventFinder, PhaseLines
-from jointctl.tools.session.elmo_drive import serial_fault_text
+from jointctl.tools.session.elmo_drive import ElmoSession, serial_fault_text
 from jointctl.tools.session.fault_words import (
     FAULT_TEXTS,
     FaultText,
@@ -138,6 +138,23 @@ def test_a_status_with_the_servo_on_does_not_pass_for_a_motor_that_was_switched_
     text = serial_fault_text(Fault.DRIVE_NOT_ENABLED, float(status))
     assert text is not None
     assert words in text.happened
+
+
+@pytest.mark.parametrize(
+    ("status", "motor_fault", "words"),
+    [
+        (0x87, 0, "; the drive says safe torque off (STO)"),
+        (0xC0, 0, ""),
+        (0x87, 0x20000, "; the drive says MF 20000h ("),
+    ],
+)
+def test_a_serial_fault_without_a_motor_fault_names_what_the_amplifier_reports(
+    status: int, motor_fault: int, words: str
+) -> None:
+    """Its hint was to see the drive's motor fault, which is none where STO was opened."""
+    text = ElmoSession().fault_text(CONFIG, Fault.DRIVE_FAULT, float(status), motor_fault)
+    assert text.happened.partition("h)")[2].startswith(words)
+    assert bool(text.happened.partition("h)")[2]) is bool(words)
 
 
 # --- What the loop reports without ending the run: each once, with its numbers and what to do about it ---
@@ -439,6 +456,19 @@ def test_no_verb_names_a_log_that_is_lost(tmp_path: Path, monkeypatch: pytest.Mo
     runs.one()
     assert runs.last_end["stage"] == "ended"
     assert f"log      {'lost' if lost else tmp_path / 'run.mcap'}" in runs.last_end["lines"]
+
+
+@pytest.mark.parametrize(("by", "fault"), [("", Fault.BUS_ERROR), ("SIGINT", Fault.NONE)])
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_motion_that_measures_names_its_log_where_it_was_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str, fault: Fault, lost: bool
+) -> None:
+    found, err = replace(result(tmp_path, fault), stopped_by=by, log_lost=lost), io.StringIO()
+    monkeypatch.setattr(carry_out, "Session", lambda *_: SimpleNamespace(run=lambda: found, drive_state="off"))
+    plan: Any = SimpleNamespace(config=changed(CONFIG, log__folder=tmp_path))
+    with contextlib.nullcontext() if by else pytest.raises(MotionFault, match="no map"):
+        assert carry_out.carried_out(plan, Output(stderr=err), "map", assume_yes=True, dry_run=False) == 130
+    assert (f"log: {tmp_path / 'run.mcap'}" in err.getvalue()) is not lost
 
 
 def reported_to_a_full_disk(found: RunResult) -> int:
