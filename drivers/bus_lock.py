@@ -455,6 +455,7 @@ def _program(pid: int) -> str:
 
 LOOKS = 3  # at all buses, after their controllers have ended
 LONGEST_S = 300.0  # that a program may ask for: four time-outs of a stop are at most 60 s each
+REFUSED_S = 2.0  # for a program of another user, which ends by itself when it sees its drive stopped
 TERM_S = 1.0  # between SIGTERM and SIGKILL
 KILL_S = 2.0
 POLL_S = 0.02
@@ -473,7 +474,7 @@ class StopCall(contextlib.AbstractContextManager["StopCall"]):
     def __init__(self, interface: str, channel: str) -> None:
         self._place, self._name = (interface, channel), lock_name(interface, channel)
         self._unnoted: OSError | None = None
-        self._noted_ns = 0
+        self._noted_ns, self.unended = 0, ""  # of our note; who goes on, and may enable the drive again
         self._note()
         self._ask()
 
@@ -506,19 +507,19 @@ class StopCall(contextlib.AbstractContextManager["StopCall"]):
             wait_for_answers(self._holders)
         controllers = [holder for holder in self._holders if holder.is_controller]
         for holder in controllers:
-            if holder.refused:
-                note(f"the program that controls the bus (pid {holder.pid}) cannot be ended: {holder.refused}")
-            elif holder.within_s is not None:
+            if holder.within_s is not None:
                 note(f"stopping the program that controls the bus (pid {holder.pid})")
-        waited_for = [holder for holder in controllers if holder.within_s is not None]
-        if waited_for:
-            within_s = min(max(holder.within_s or 0.0 for holder in waited_for), LONGEST_S)
-            give_up_s = time.monotonic() + within_s
-            while time.monotonic() < give_up_s:
-                waited_for = [holder for holder in waited_for if not holder.left]
-                if not waited_for and not any(is_marked(pid, self._name) for pid in marked):
-                    break
-                time.sleep(POLL_S)
+        waited_for = [holder for holder in controllers if holder.within_s is not None or holder.refused]
+        times_s = (REFUSED_S if holder.refused else holder.within_s or 0.0 for holder in waited_for)
+        give_up_s = time.monotonic() + min(max(times_s, default=0.0), LONGEST_S)
+        while time.monotonic() < give_up_s:
+            waited_for = [holder for holder in waited_for if not holder.left]
+            if not waited_for and not any(is_marked(pid, self._name) for pid in marked):
+                break
+            time.sleep(POLL_S)
+        self.unended = ""
+        for holder in (one for one in waited_for if one.refused):
+            self.unended = f"the program that controls the bus (pid {holder.pid}) cannot be ended: {holder.refused}"
         self._end_by_force(note)
         if controllers or marked:
             ended()
@@ -553,7 +554,7 @@ class StopCall(contextlib.AbstractContextManager["StopCall"]):
         for number, wait_s in ((signal.SIGTERM, TERM_S), (signal.SIGKILL, KILL_S)):
             pids = _signalled(marked_processes(self._name), self._name, number, wait_s)
         if pids:
-            note(f"process {', '.join(map(str, pids))} cannot be ended; the drive may be enabled again")
+            self.unended = f"process {', '.join(map(str, pids))} cannot be ended"
 
 
 def end_programs(

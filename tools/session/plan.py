@@ -6,6 +6,7 @@ it (`Motion.placed`); what is shown of it, and asked, is below.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -478,7 +479,12 @@ def require_terminal(
 
 
 def agreed(output: Output, question: str = MOVE) -> bool:
-    """Whether the user says yes; everything else is no."""
+    """Whether the user says yes; everything else is no, and what was typed before the question is no answer."""
+    with contextlib.suppress(ImportError, OSError, ValueError):  # a system without them, or a stream of a program
+        import termios
+
+        if sys.stdin.isatty():
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
     output.note(f"{question} [y/N] ")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

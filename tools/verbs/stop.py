@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AS_CONFIGURED, BusOptions, ConfigPath, ResultOutput, config_path, place
 
@@ -64,6 +64,8 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
         if not unread:
             _warn_of(path, output)
         require_off(state)
+    if unended := next(filter(None, (call.unended for call in calls)), ""):
+        raise BusError(f"{unended}; the drive may be enabled again", "end it as its user, or as root")
     if unread:
         raise unread[0]
     return 0

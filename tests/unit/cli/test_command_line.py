@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +21,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.bus_lock import StopCall
+from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.tools import child_process
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.elmo import elmo_section
@@ -128,6 +131,23 @@ def test_nothing_that_takes_its_time_is_loaded_before_the_drive_is_stopped(
     path = str(edited_file(tmp_path, (place, own), base=base))
     shown = subprocess.run([sys.executable, "-c", STOP, path], capture_output=True, text=True, check=True)
     assert shown.stdout.splitlines()[0] == "[]"
+
+
+@pytest.mark.parametrize("unended", ["process 7 cannot be ended", ""])
+def test_a_stop_that_could_not_end_the_program_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unended: str
+) -> None:
+    def end(call: StopCall, *_: object) -> bool:
+        call.unended = unended
+        return False
+
+    monkeypatch.setattr(StopCall, "end", end)
+    stop = importlib.import_module("jointctl.tools.verbs.stop")
+    monkeypatch.setattr(stop, "_switch_off", lambda *_: ["switch on disabled"])
+    path = edited_file(tmp_path, ('channel = "virtual0"', f'channel = "virtual-{os.getpid()}"'), base="virtual")
+    expected = pytest.raises(BusError, match="7 cannot be ended; the drive may be enabled again")
+    with expected if unended else nullcontext():
+        assert stop.stop(path, QUIET) == 0
 
 
 @pytest.mark.parametrize("shipped", ["virtual", "precise", "elmo_serial.toml"])

@@ -320,6 +320,25 @@ def test_a_stop_of_another_user_is_refused(channel: str, monkeypatch: pytest.Mon
     assert stopped == [1] * allowed
 
 
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_program_of_another_user_that_goes_on_is_no_stop(
+    channel: str, monkeypatch: pytest.MonkeyPatch, leaves: bool
+) -> None:
+    """It was a remark beside "the drive is switch on disabled", and nothing with -q; the twin ends by itself."""
+    monkeypatch.setattr(bus_lock, "may_ask", lambda _: False)
+    monkeypatch.setattr(bus_lock, "REFUSED_S", 60.0 if leaves else 0.05)
+    monkeypatch.setattr(bus_lock, "marked_processes", lambda _: [])  # it would be this process
+    with BusLock("socketcan", channel) as lock, StopCall("socketcan", channel) as call:
+        closing = threading.Timer(0.2, lock.close)
+        if leaves:
+            closing.start()
+        assert end_programs([call], pytest.fail)
+        assert call.unended == (
+            "" if leaves else f"the program that controls the bus (pid {os.getpid()}) cannot be ended: "
+            "this program belongs to another user"
+        )  # fmt: skip
+
+
 def test_a_program_that_cannot_stop_acknowledges_all_the_same(channel: str) -> None:
     with BusLock("socketcan", channel), asked(channel, "stop") as holder:
         assert holder.within_s == STOP_WITHIN_S

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
+import os
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +35,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.session import run_watch as run_watch_module
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
-from jointctl.tools.session.plan import require_braking, resolve
+from jointctl.tools.session.plan import agreed, require_braking, resolve
 from jointctl.tools.session.run_watch import Around, BusWatch, RunParts, RunWatch
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.options import SweepOptions, both_directions, ordered_points
@@ -417,3 +420,23 @@ def test_the_motion_check_looks_as_well(tmp_path: Path) -> None:
     plan = check_plan(config, None)
     check = CheckMotion(config_of_check(config, plan), plan).constants(report(), motion_table(plan, 0.1))[0].sequence
     assert (check.start_rad, check.moved_max_rad) == (0.1, pytest.approx(1.25 * plan.travel_rad))
+
+
+@pytest.mark.parametrize(("early", "late", "yes"), [("y\n", "n\n", False), ("n\n", "y\n", True), ("", "y\n", True)])
+def test_what_was_typed_before_the_question_is_no_answer(
+    monkeypatch: pytest.MonkeyPatch, early: str, late: str, yes: bool
+) -> None:
+    """While the loop compiled, say: the joint moved at once when it was ready."""
+    leader, follower = os.openpty()
+
+    class Answering(io.StringIO):
+        def write(self, text: str) -> int:
+            if "[y/N]" in text:
+                os.write(leader, late.encode())
+            return super().write(text)
+
+    os.write(leader, early.encode())
+    with open(follower) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert agreed(Output(stderr=Answering())) is yes
+    os.close(leader)
