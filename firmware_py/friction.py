@@ -272,7 +272,9 @@ def step_lugre(
 # encoder and every Nm that is fed forward too much.  They have to be let go: by as much as the joint is seen to go on,
 # and of a joint that is not rigid, whose gains are too low to hold it, by half at once.  They spring back by what they
 # were let go of, over their stiffness as it was found (`_share_kept`).  There the joint is a spring, and for a moment
-# an integrator of that stiffness takes a rigid one back; for longer it would swing between two counts.
+# an integrator of that stiffness takes a rigid one back; for longer it would swing between two counts.  An adapting law
+# holds it `BEHIND` of a count behind its place, away from the edge that it would creep over, and lets go by `UNSEEN`
+# of a count less than the reading shows: where a count begins to show, the joint has only come over its edge.
 # Of a joint that is not rigid the observer is slow as well: what it has found on arrival is mostly friction of this
 # direction.  It keeps the mean of both directions, which is a load.
 #
@@ -290,6 +292,8 @@ TAKEN_radps = 20.0  # slow: with a reducer that is not rigid, friction moves the
 LET_GO = 2.0  # by how many times their stiffness the bristles give way to a joint that goes on
 LET_GO_s = 0.01  # not at once, or the joint, a spring there, would swing back too far
 BACK_radps, BACK_s = 30.0, 0.08  # a rigid one goes back, for this time
+UNSEEN = 0.4  # counts that it seems to go on where it has only come over an edge
+BEHIND = 0.2  # counts by which it is held behind its place, since it creeps on and never back
 TURNING_CYCLES = 4  # a motion that turns back rests for one
 MOST_LET_GO, MOST_HELD = 0.8, 0.95  # of what they held when the motion came to rest
 AT_ONCE, AT_ONCE_s = 0.5, 0.03  # of a joint that is not rigid, in this time
@@ -334,6 +338,7 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState, lin
     state.twist_covariance[0, 0], state.twist_covariance[1, 1] = OFFSET_VARIANCE_rad2, SHARE_VARIANCE
     state.twist_covariance[0, 1] = state.twist_covariance[1, 0] = 0.0
     state.resting = 0
+    state.behind_rad = 0.0
     state.cycle = 0
     state.newest = 0
     for i in range(len(state.fed_Nm)):
@@ -424,6 +429,7 @@ def _comes_to_rest(
     """
     if abs(desired_radps) >= STILL_radps:
         state.resting = 0
+        state.behind_rad = 0.0
         side = 0 if desired_radps > 0.0 else 1
         state.moved_s[side] = min(state.moved_s[side] + law.period_s, AVERAGED_s)
         newer_Nm = disturbance_Nm - state.mean_disturbance_Nm[side]
@@ -434,10 +440,15 @@ def _comes_to_rest(
         if law.kind == ControllerKind.FLEXIBLE_JOINT and min(state.moved_s[0], state.moved_s[1]) > LEAST_MOVED_s:
             state.rest_disturbance_Nm = 0.5 * (state.mean_disturbance_Nm[0] + state.mean_disturbance_Nm[1])
         state.rest_friction_Nm, state.to_let_go_Nm = held_Nm, 0.0
-        state.rest_error_rad = max(math.copysign(error_rad, error_rad * held_Nm), 0.0)
+        state.rest_error_rad = (
+            max(math.copysign(error_rad, error_rad * held_Nm), 0.0) + UNSEEN * law.adaptation.count_rad
+        )
     if (state.resting - TURNING_CYCLES) * law.period_s <= BACK_s:
         state.resting += 1
-    return state.resting > TURNING_CYCLES and state.moved_s[0] + state.moved_s[1] > 0.0
+    rests = state.resting > TURNING_CYCLES and state.moved_s[0] + state.moved_s[1] > 0.0
+    if rests and state.rest_friction_Nm != 0.0:
+        state.behind_rad = math.copysign(BEHIND * law.adaptation.count_rad, state.rest_friction_Nm)
+    return rests
 
 
 @kernel

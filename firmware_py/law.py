@@ -460,7 +460,7 @@ def step_law(
     """
     if constants.kind == ControllerKind.OUTSIDE:
         return state.outside_torque_Nm
-    error = position_rad - reference.position_rad
+    error = position_rad - reference.position_rad + state.adaptation.behind_rad
     velocity_radps = velocity.velocity_radps
     if constants.observer.kalman != 0:
         observer = state.observer

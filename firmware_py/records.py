@@ -112,6 +112,7 @@ class AdaptationConstants:
     friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
     late_cycles: i4  # from what is fed forward to the friction that the observer compares it with
     reach: f8  # by which all of them together may leave the configured friction
+    count_rad: f8  # of the encoder that feeds the law of a rigid joint; 0 = not rigid, or no adaptation
     seen: VelocityConstants  # of the speeds that a flexible joint is seen to have
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
@@ -134,6 +135,7 @@ class AdaptationState:
     rest_disturbance_Nm: f8  # of the observer's, what it keeps at rest
     rest_friction_Nm: f8  # of the bristles, when the desired motion came to rest
     rest_error_rad: f8  # the furthest in the direction of that torque since
+    behind_rad: f8  # what is added to the error at rest, so that the joint stands a little behind
     to_let_go_Nm: f8  # what of their torque the bristles have still to give up
     resting: i4  # cycles since, 0 while it goes on
     cycle: i4

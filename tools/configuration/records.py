@@ -224,6 +224,7 @@ def _fill_adaptation(record: AdaptationConstants, config: Config, adaptation: Ad
     record.enabled = 1
     _fill_velocity(record.seen, config, SEEN_Hz)
     _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
+    record.count_rad = 0.0 if config.control.kind == "flexible_joint" else law_resolution_rad(config)
     record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
     record.ripples = len(adaptation.ripple_per_motor_turn)
     for i, order in enumerate(adaptation.ripple_per_motor_turn):

@@ -13,6 +13,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.friction import (
     AS_CONFIGURED,
     AT_ONCE,
+    BEHIND,
     LET_GO,
     MOST,
     MOST_HELD,
@@ -20,6 +21,7 @@ from jointctl.firmware_py.friction import (
     SINES,
     STIFFNESS,
     TURNING_CYCLES,
+    UNSEEN,
     AT_ONCE_s,
     BACK_radps,
     BACK_s,
@@ -211,6 +213,51 @@ def test_the_bristles_let_go_of_a_joint_that_goes_on_after_the_move(law: Any, si
     assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(least)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_first_count_is_not_all_of_it_way_that_the_joint_went_on(law: Any, side: float) -> None:
+    count = 5e-5
+    law.adaptation.count_rad = count
+    for counts, let_go in ((0.99 * UNSEEN, 0.0), (1.0, (1.0 - UNSEEN) * LET_GO * 8e4 * count)):
+        state, fed = arrived(law, side)
+        for _ in range(TURNING_CYCLES + 2 + round(BACK_s / law.period_s)):
+            take_at_rest(law, state, 0.0, 0.0, 0.0)
+        for _ in range(20 * round(LET_GO_s / law.period_s)):
+            take_at_rest(law, state, 0.0, 0.0, side * counts * count)
+        assert side * (fed - adapted_feed_forward_Nm(law, state, 0.0, 0.0)) == pytest.approx(let_go, abs=1e-6)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_rigid_joint_at_rest_is_held_a_fifth_of_a_count_behind_in_the_direction_it_came(
+    law: Any, side: float
+) -> None:
+    law.adaptation.count_rad = 5e-5
+    state, _ = arrived(law, side)
+    for _ in range(TURNING_CYCLES):  # it may only turn back
+        take_at_rest(law, state, 0.0, 0.0, 0.0)
+        assert state.behind_rad == 0.0
+    for _ in range(2000):
+        take_at_rest(law, state, 0.0, 0.0, 0.0)
+        assert state.behind_rad == side * BEHIND * 5e-5
+    take_at_rest(law, state, 0.0, -side * 0.01, 0.0)
+    assert state.behind_rad == 0.0
+
+
+def test_a_joint_that_has_not_moved_yet_is_not_held_behind(law: Any) -> None:
+    law.adaptation.count_rad, state = 5e-5, fresh(law)
+    for k in range(1000):
+        take_at_rest(law, state, 0.01 * k, 0.0, 0.0)
+    assert state.behind_rad == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "adapts", "counts"), [("precise", True, 1.0), ("precise", False, 0.0), ("realistic", True, 0.0)]
+)
+def test_only_the_adapting_law_of_a_rigid_joint_takes_note_of_the_count(name: str, adapts: bool, counts: float) -> None:
+    config = shipped(name, **({"control__adaptation": Adaptation()} if adapts else {}))
+    constants = controller_constants(config, Controller(name, config.control, config.friction), 0.0)
+    assert constants[0].law.adaptation.count_rad == pytest.approx(counts * law_resolution_rad(config))
+
+
 def held_by(law: Any, state: Any, stiffness: float, error: float, seconds: float) -> tuple[float, float]:
     """(error, friction fed forward) after so long of a joint that stands on bristles which were not configured."""
     fed = adapted_feed_forward_Nm(law, state, 0.0, 0.0)
@@ -347,19 +394,28 @@ def test_motions_that_never_repeat_are_followed_better(kind: Any, more: dict[str
     assert sum(after) < share * sum(before)
 
 
-def test_the_joint_stands_where_a_move_has_ended() -> None:
+@pytest.mark.parametrize(
+    ("seed", "indices", "duration_s", "least"),
+    [
+        (52077, (2, 3, 11, 14), 40.0, 0.65),  # 18 and 19 bit; bristles of half to three times the stiffness configured
+        (7001, (4, 8), 75.0, 0.88),  # 18 and 17 bit: 0.76 where it is not held behind, and lets go of all of a count
+    ],
+)
+def test_the_joint_stands_where_a_move_has_ended(
+    seed: int, indices: tuple[int, ...], duration_s: float, least: float
+) -> None:
     """Within 20 microradians or a count from 50 ms on after most moves, which bristles at their limit do not allow."""
-    base, shares = shipped("precise", trajectory__duration_s=40.0), []
-    for index in (2, 3, 11, 14):  # 18 and 19 bit; bristles of half to three times the stiffness that is configured
-        config = random_plant(base, EnsembleSettings(), 52077, index)
-        joint, motion = LockstepJoint(config), random_motion("point_to_point", 52077, index, 40.0)
+    base, shares = shipped("precise", trajectory__duration_s=duration_s), []
+    for index in indices:
+        config = random_plant(base, EnsembleSettings(), seed, index)
+        joint, motion = LockstepJoint(config), random_motion("point_to_point", seed, index, duration_s)
         controller = adaptive(named(("precise",))[0], **PAIRED)
         constants = controller_constants(config, controller, joint.report.start_position_rad)
         run = run_scenario(joint, constants, "point_to_point", motion=motion)
         figures = error_figures(run, 15.0, motion, law_resolution_rad(config))
         assert figures.settled_share is not None
         shares.append(figures.settled_share)
-    assert np.mean(shares) > 0.65
+    assert np.mean(shares) > least
 
 
 @pytest.mark.parametrize("believed", [0.03, 0.25])
