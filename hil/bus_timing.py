@@ -39,7 +39,6 @@ class Wire:
     sender: i8  # slot of the node whose frame is on the wire, or NO_NODE
     delivered_ns: i8
     free_ns: i8
-    bits: i8  # of the frame on the wire
 
 
 class Waiting(NamedTuple):
@@ -149,7 +148,6 @@ def _start_next(wire: np.ndarray, waiting: Waiting, on_wire: np.ndarray) -> None
     counts[winner] -= 1
     bits = frame_bits(on_wire)
     wire[0].sender = winner
-    wire[0].bits = bits
     wire[0].delivered_ns = start_ns + (bits - INTERFRAME_BITS) * NANOSECONDS // wire[0].bitrate_bitps
     wire[0].free_ns = start_ns + bits * NANOSECONDS // wire[0].bitrate_bitps
 

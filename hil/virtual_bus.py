@@ -38,7 +38,6 @@ from jointctl.hil.bus_timing import (
     Waiting,
     Wire,
     finish_frame,
-    frame_bits,
     note_sent,
     outlived,
     over,
@@ -105,27 +104,18 @@ class BusCounters:
     """What the bus did since its start.  `dropped` counts per receiver: one frame lost by two clients counts 2."""
 
     frames: i8
-    bits: i8  # on the wire, exact, with stuff bits and interframe space
     dropped: i8
     malformed: i8  # datagrams of a wrong size, data length above 8, error frames
     late: i8  # answers left out, as the computer held them up until their SYNC was over
     clients: i8  # now
-    accepted: i8
-    refused: i8
-    busy_ns: i8  # wire time of the frames at the bit rate
-    work_ns: i8  # time that the hub itself worked
 
 
 @record
-class ClientCounters:
-    """One slot of the hub: a client's descriptor (or -1) and what it sent and got since it connected."""
+class Client:
+    """One slot of the hub."""
 
-    fd: i4
+    fd: i4  # or NO_FD
     state: i4
-    sent: i8
-    delivered: i8
-    dropped: i8
-    malformed: i8
 
 
 @kernel
@@ -154,14 +144,8 @@ def _accept(listener: int, clients: np.ndarray, bus: np.ndarray, scratch: np.nda
             _set_option(fd, _SO_TIMESTAMPNS, 1, scratch)
             clients[node].fd = fd
             clients[node].state = CONNECTED
-            clients[node].sent = 0
-            clients[node].delivered = 0
-            clients[node].dropped = 0
-            clients[node].malformed = 0
             bus[0].clients += 1
-            bus[0].accepted += 1
             return 1
-    bus[0].refused += 1
     libc.close(np.int32(fd))
     return 1
 
@@ -208,17 +192,13 @@ def _read(node: int, hung_up: bool, clients: np.ndarray, bus: np.ndarray, frame:
             bus[0].clients -= 1
         return False
     if got != FRAME_SIZE or frame[0]["length"] > 8 or frame[0]["identifier"] & _ERROR_FRAME:
-        clients[node].malformed += 1
         bus[0].malformed += 1
         return False
-    clients[node].sent += 1
     return True
 
 
 @kernel
-def _deliver(
-    sender: int, bits: int, bitrate_bitps: int, clients: np.ndarray, bus: np.ndarray, frame: np.ndarray
-) -> None:
+def _deliver(sender: int, clients: np.ndarray, bus: np.ndarray, frame: np.ndarray) -> None:
     """Hand `frame[0]` to every client but its sender, without waiting for any of them."""
     for node in range(MAX_CLIENTS):
         if node != sender and clients[node].fd >= 0:
@@ -228,14 +208,9 @@ def _deliver(
                 np.uintp(FRAME_SIZE),
                 np.int32(libc.MSG_DONTWAIT | libc.MSG_NOSIGNAL),
             )
-            if done == FRAME_SIZE:
-                clients[node].delivered += 1
-            else:
-                clients[node].dropped += 1
+            if done != FRAME_SIZE:
                 bus[0].dropped += 1
     # Last, so that who sees the frame counted sees all its deliveries counted, too.
-    bus[0].bits += bits
-    bus[0].busy_ns = bus[0].bits * libc.NANOSECONDS // bitrate_bitps
     bus[0].frames += 1
 
 
@@ -245,7 +220,7 @@ class HubMemory(NamedTuple):
     stop_word: np.ndarray  # int64[1]
     poll_words: np.ndarray  # int64[POLL_COUNT]
     scratch: np.ndarray  # int64[SCRATCH_WORDS]
-    clients: np.ndarray  # ClientCounters[MAX_CLIENTS]
+    clients: np.ndarray  # Client[MAX_CLIENTS]
     bus: np.ndarray  # BusCounters
     watch: np.ndarray  # SyncWatch
     wire: np.ndarray  # Wire
@@ -266,8 +241,7 @@ def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool | None) -
         memory.bus[0].late += 1
         return
     if timing is None:
-        bits, bitrate = frame_bits(memory.frame), memory.wire[0].bitrate_bitps
-        _deliver(node, bits, bitrate, memory.clients, memory.bus, memory.frame)
+        _deliver(node, memory.clients, memory.bus, memory.frame)
     else:
         pend_frame(memory.frame, node, began_ns, memory.waiting)
 
@@ -285,7 +259,7 @@ def _finish_frames(memory: HubMemory, now_ns: int, timing: bool | None) -> None:
         if outlived(memory.watch[0], memory.frame_bytes[0], sender, monotonic_ns(memory.scratch)):
             memory.bus[0].late += 1
             continue
-        _deliver(sender, wire[0].bits, wire[0].bitrate_bitps, memory.clients, memory.bus, frames)
+        _deliver(sender, memory.clients, memory.bus, frames)
 
 
 @kernel
@@ -299,7 +273,6 @@ def run_hub(listener: int, wake: int, timing: bool | None, memory: HubMemory) ->
     )  # fmt: skip
     frames, waiting = memory.frame, memory.waiting
     accepting = True
-    began_ns = monotonic_ns(scratch)
     while load_acquire(memory.stop_word, 0) == 0:
         for node in range(MAX_CLIENTS):
             poll_words[node] = _poll_word(clients[node].fd, waiting.counts[node] < QUEUE_DEPTH)
@@ -307,11 +280,9 @@ def run_hub(listener: int, wake: int, timing: bool | None, memory: HubMemory) ->
         # The listener is looked at last and served first: a client that connected before a frame was sent is
         # then always there when that frame is read (one frame of each client a round).
         poll_words[_LISTENER] = _poll_word(listener, accepting)
-        now_ns = monotonic_ns(scratch)
-        bus[0].work_ns += now_ns - began_ns
         timeout = np.uintp(0)
         if timing is not None and wire[0].sender != NO_NODE:
-            rest_ns = max(wire[0].delivered_ns - now_ns, 0)
+            rest_ns = max(wire[0].delivered_ns - monotonic_ns(scratch), 0)
             scratch[0] = rest_ns // libc.NANOSECONDS
             scratch[1] = rest_ns % libc.NANOSECONDS
             timeout = np.uintp(scratch.ctypes.data)
@@ -449,8 +420,7 @@ def remove_dead_sockets(folder: Path) -> int:
 class VirtualBusHub:
     """A running virtual bus at a socket path; use it as a context manager, or `start` and `stop`.
 
-    `bitrate_bitps` gives the bus load and, with `timing`, the duration of each frame.  `counters` and
-    `client_counters` may be read at any time while the hub runs.
+    `bitrate_bitps` gives, with `timing`, the duration of each frame.  `counters` may be read while the hub runs.
     """
 
     def __init__(self, path: str | os.PathLike[str], bitrate_bitps: int = 1_000_000, timing: bool = False) -> None:
@@ -469,7 +439,7 @@ class VirtualBusHub:
     def _reset(self) -> None:
         self._stop_word[0] = 0
         self._bus = new(BusCounters)
-        self._clients = new(ClientCounters, MAX_CLIENTS)
+        self._clients = new(Client, MAX_CLIENTS)
         self._clients["fd"] = NO_FD
         self._wire = new(Wire)
         self._wire["bitrate_bitps"] = self.bitrate_bitps
@@ -563,9 +533,3 @@ class VirtualBusHub:
     @property
     def counters(self) -> Any:
         return self._bus.copy()[0]
-
-    @property
-    def client_counters(self) -> Any:
-        """A copy of the ClientCounters records of the clients that are connected now, in the order of their slots."""
-        clients = self._clients.copy()
-        return clients[clients["state"] == CONNECTED]

@@ -136,8 +136,6 @@ class HubContract(BusContract):
         lost = int(hub.counters["dropped"])
         kept = 3000 - lost
         assert lost > 0
-        assert list(hub.client_counters["dropped"]) == [0, lost, 0]
-        assert list(hub.client_counters["delivered"]) == [0, kept, 3000]
         # It finds the oldest frames in order, and after them the new ones.
         assert [sleeper.receive() for _ in range(kept)] == [(n % 0x700, b"12345678") for n in range(kept)]
         assert sleeper.receive(SHORT_S) is None
@@ -155,7 +153,6 @@ class HubContract(BusContract):
             assert receiver.receive() == (0x55, b"")
             assert hub.counters["malformed"] == 7
             eventually(lambda: hub.counters["frames"] == 1, 60.0)
-            assert sorted(hub.client_counters["malformed"]) == [0, 7]
 
     def test_one_that_dies_with_unread_frames_is_removed(self, hub: VirtualBusHub, join: Any) -> None:
         sender, dying, receiver = join(), join(), join()

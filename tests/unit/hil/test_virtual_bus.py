@@ -205,23 +205,6 @@ def assert_passes_frames(path: Path) -> None:
         assert b.recv(64) == FRAME
 
 
-def test_counters(path: Path) -> None:
-    with VirtualBusHub(path, bitrate_bitps=500_000) as hub, join(path) as a, join(path) as b:
-        for _ in range(10):
-            a.send(FRAME)
-            assert b.recv(64) == FRAME
-        record = new(WireFrame)
-        record["identifier"], record["length"], record["payload"] = 0x601, 8, range(8)
-        bits = 10 * frame_bits(record)
-        eventually(lambda: hub.counters["frames"] == 10, 60.0)
-        counters = hub.counters
-        assert (counters["bits"], counters["busy_ns"]) == (bits, bits * 2000)
-        assert (counters["clients"], counters["accepted"], counters["refused"]) == (2, 2, 0)
-        assert (counters["dropped"], counters["malformed"]) == (0, 0)
-        assert list(hub.client_counters["sent"]) == [10, 0]
-        assert list(hub.client_counters["delivered"]) == [0, 10]
-
-
 def test_the_socket_is_for_this_user_and_goes_with_the_hub(path: Path) -> None:
     hub = VirtualBusHub(path).start()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -312,7 +295,6 @@ def test_clients_up_to_the_limit_and_one_more(path: Path) -> None:
         eventually(lambda: hub.counters["clients"] == MAX_CLIENTS, 60.0)
         with join(path) as refused:
             assert refused.recv(64) == b""
-        assert hub.counters["refused"] == 1
         clients[0].send(FRAME)
         assert all(client.recv(64) == FRAME for client in clients[1:])
         clients.pop().close()
