@@ -23,8 +23,7 @@ REMOTE_FLAG = 0x40000000
 ERROR_FLAG = 0x20000000
 FRAME_BYTES = 16
 FRAME_STRUCT = struct.Struct("<IB3x8s")  # identifier with its flags, length, data
-_STANDARD_STUFFED_BITS = 34  # start, 11 bit identifier, control, CRC sequence: the part that is bit-stuffed
-_EXTENDED_STUFFED_BITS = 54
+_STUFFED_BITS = 34  # start, 11 bit identifier, control, CRC sequence: the part that is bit-stuffed
 _TAIL_BITS = 13  # CRC delimiter, acknowledge slot and delimiter, end of frame (7), interframe space (3)
 _LONGEST_DATA = 8
 
@@ -39,11 +38,11 @@ class Frame:
     payload: Annotated[np.ndarray, array_of(u1, 8)]
 
 
-def worst_frame_bits(length: int, extended: bool = False) -> int:
+def worst_frame_bits(length: int) -> int:
     """Bits of a frame of `length` data bytes at worst: one stuff bit after the first 5 bits, then after every 4."""
     if not 0 <= length <= _LONGEST_DATA:
         raise ValueError(f"data length (={length}) must be in [0..{_LONGEST_DATA}] bytes")
-    stuffed = (_EXTENDED_STUFFED_BITS if extended else _STANDARD_STUFFED_BITS) + 8 * length
+    stuffed = _STUFFED_BITS + 8 * length
     return stuffed + (stuffed - 1) // 4 + _TAIL_BITS
 
 
