@@ -24,7 +24,7 @@ from jointctl.tools.scoping.remote import remote
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
-from jointctl.tools.session.display import OnlyShows, PreparedMotion, ViewerRequest
+from jointctl.tools.session.display import Display, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loop_memory import RING_RECORDS
 from jointctl.tools.session.plan import FreeMotion, resolve
@@ -67,7 +67,7 @@ class _Approval:
         return self.answer
 
 
-class _ProgramDisplay(OnlyShows):
+class _ProgramDisplay(Display):
     """What the run says is kept for the program; motions of the program go to the session."""
 
     def __init__(self, stop_if_over: Callable[[], None]) -> None:

@@ -27,7 +27,7 @@ from jointctl.tools.configuration.sections import FAULT_KINDS
 from jointctl.tools.session import control as session_control
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.control import STOOD_S, Control, StopSignals
-from jointctl.tools.session.display import OnlyShows, Snapshot
+from jointctl.tools.session.display import Display, Snapshot
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.session.result import RunResult
@@ -154,7 +154,7 @@ def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duratio
 
 
 # --- what is asked of the drive after the fault, and between two motions ---
-class AtTracking(OnlyShows):
+class AtTracking(Display):
     """Does something to the drive once the joint tracks."""
 
     def __init__(self, do: Callable[[], None]) -> None:

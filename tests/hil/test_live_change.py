@@ -15,7 +15,7 @@ from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.session.display import OnlyShows, Snapshot, ViewerRequest
+from jointctl.tools.session.display import Display, Snapshot, ViewerRequest
 from jointctl.tools.session.result import RunResult
 from tests.sessions import session_of
 
@@ -23,7 +23,7 @@ WHO = "a test"
 SINE = {"kind": "sine", "duration_s": 0.0, "amplitude_rad": 0.1, "frequency_Hz": 0.5, "offset_rad": 0.2}
 
 
-class Script(OnlyShows):
+class Script(Display):
     """Asks for one thing after the other, each as soon as the one before has come to its end, then stops."""
 
     def __init__(self, requests: Sequence[ViewerRequest]) -> None:

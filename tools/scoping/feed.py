@@ -25,7 +25,7 @@ from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.recording.ros_messages import JOINT_NAMES, StateCycles
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
+from jointctl.tools.session.display import LONGEST_BYTES, Display, Snapshot, ViewerRequest, decoded
 
 if TYPE_CHECKING:
     from jointctl.tools.scoping.remote import RemoteOrder
@@ -104,8 +104,8 @@ def require_free(what: str, host: str, port: int, hint: str) -> None:
         raise DataError(f"{what} cannot be served at {host}:{port}: {error.strerror or error}", hint) from None
 
 
-class ScopeFeed:
-    """A `Display` that passes everything on to the server; nothing in it raises or waits.
+class ScopeFeed(Display):
+    """Passes everything on to the server; nothing in it raises or waits.  Remarks and phases are events as well.
 
     `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
     page has been open for so long; None = it goes on.  In any case it is reported in the terminal and the log.
@@ -145,12 +145,6 @@ class ScopeFeed:
             self._end.send(kind + body)
         except OSError:  # full, or the server has gone
             self.dropped += 1
-
-    def note(self, text: str) -> None:
-        """Remarks are events as well."""
-
-    def phase(self, text: str) -> None:
-        """So are phases."""
 
     def show(self, snapshot: Snapshot) -> None:
         shown: dict[str, Any] = {"temperature_degC": snapshot.temperature_degC}

@@ -1,4 +1,4 @@
-"""What a run sends to a display, and what comes back: the `Display` protocol, several as one, lines, a calm panel."""
+"""What a run sends to a display, and what comes back: the `Display`, several as one, lines, a calm panel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import select
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, Group, RenderResult
@@ -78,7 +78,7 @@ def decoded(message: bytes) -> ViewerRequest | None:
     return ViewerRequest(kind, " ".join(who.split())[:80], values)
 
 
-# --- What a run reports to its viewers, and what it hears from them: the `Display` protocol and the `Snapshot` ---
+# --- What a run reports to its viewers, and what it hears from them: the `Display` and the `Snapshot` ---
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class Snapshot:
     axis: int = 0  # its number
 
 
-class Display(Protocol):
-    """Shows how a run goes; nothing in it may raise or wait."""
+class Display:
+    """Shows how a run goes; nothing in it may raise or wait.  As it is, it shows faults alone and takes no orders."""
 
     def note(self, text: str) -> None:
         """A remark that stays."""
@@ -109,63 +109,33 @@ class Display(Protocol):
         """The state of things, called many times a second."""
 
     def event(self, event: Event) -> None:
-        """Something that went into the log as an event."""
-
-    def stop_request(self) -> StopRequest:
-        """What a viewer asks for."""
-
-    def stop_reason(self) -> str:
-        """Who or what asked for that stop; "" if nobody did."""
-
-    def requests(self) -> Sequence[ViewerRequest]:
-        """What else they have asked for since the last call."""
-
-    def settings(self, values: Mapping[str, Any]) -> None:
-        """What can be changed in this run, and how it stands."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-class OnlyShows:
-    """What a display leaves out of `Display` when it shows nothing, takes no orders, and opens nothing."""
-
-    def note(self, text: str) -> None:
-        """See `Display`."""
-
-    def phase(self, text: str) -> None:
-        """See `Display`."""
-
-    def show(self, snapshot: Snapshot) -> None:
-        """See `Display`."""
-
-    def event(self, event: Event) -> None:
-        """A fault is reported when it happens, not only at the end of the run; the other events are in the log."""
+        """Something that went into the log; a fault is reported when it happens, not only at the end of the run."""
         if event.level >= ERROR:
             self.note(event.text)
 
     def stop_request(self) -> StopRequest:
-        """Nobody can ask for anything here; signals have their own way."""
+        """What a viewer asks for; signals have their own way."""
         return StopRequest.NONE
 
     def stop_reason(self) -> str:
+        """Who or what asked for that stop; "" if nobody did."""
         return ""
 
     def requests(self) -> Sequence[ViewerRequest]:
+        """What else they have asked for since the last call."""
         return ()
 
     def settings(self, values: Mapping[str, Any]) -> None:
-        """Nothing can be changed here."""
+        """What can be changed in this run, and how it stands."""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Nothing to take away."""
+        """What it has opened is closed."""
 
 
-class Displays:
+class Displays(Display):
     """Several displays as one."""
 
     def __init__(self, displays: Sequence[Display]) -> None:
@@ -213,7 +183,7 @@ class Displays:
 # --- A run as lines: one for each phase and remark; for pipes, files and `--json` ---
 
 
-class PhaseLines(OnlyShows):
+class PhaseLines(Display):
     """Writes a line for each phase, remark and fault."""
 
     def __init__(self, output: Output) -> None:
@@ -226,15 +196,20 @@ class PhaseLines(OnlyShows):
     phase = note
 
 
-class JointDisplay:
+class JointDisplay(Display):
     """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only.
 
-    The joints share `orders`, what was asked for and no joint has taken yet.
+    The joints share `orders`, what was asked for and no joint has taken yet.  `display` is entered once for all.
     """
 
     def __init__(self, display: Display, name: str, orders: list[ViewerRequest], axis: int) -> None:
         self._display, self._name, self._orders, self._axis = display, name, orders, axis
-        self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
+
+    def stop_request(self) -> StopRequest:
+        return self._display.stop_request()
+
+    def stop_reason(self) -> str:
+        return self._display.stop_reason()
 
     def note(self, text: str) -> None:
         self._display.note(f"{self._name}: {text}")
@@ -263,15 +238,6 @@ class JointDisplay:
 
     def _is_own(self, order: ViewerRequest) -> bool:
         return order.joint == self._name if isinstance(order, PreparedMotion) else self._axis == 0
-
-    def settings(self, values: Mapping[str, Any]) -> None:
-        """As above."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The display is entered and left once for all joints."""
 
 
 # --- What happened in a run, in words, found by comparing each log record with the one before ---
@@ -496,7 +462,7 @@ class _WholeFrames(io.StringIO):
                 os.write(self._fd, data)
 
 
-class LivePanel(OnlyShows):
+class LivePanel(Display):
     """The panel on the terminal behind file descriptor `fd`."""
 
     def __init__(self, fd: int, title: str, refresh_s: float = REFRESH_s) -> None:

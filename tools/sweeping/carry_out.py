@@ -29,7 +29,7 @@ from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
 from jointctl.tools.session.control import in_control
-from jointctl.tools.session.display import OnlyShows, Snapshot, run_display
+from jointctl.tools.session.display import Display, Snapshot, run_display
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
@@ -395,7 +395,7 @@ def sweep_run(swept: SweepPass, *, allow_low_margin: bool = False) -> RunPlan:
     return RunPlan(swept.config, swept, log_path(swept.config), allow_low_margin, LOG_EVERY, LOG_FULL_RATE_S)
 
 
-class MeterDisplay(OnlyShows):
+class MeterDisplay(Display):
     """Gives the records of a pass to the meter, and its progress to the terminal; the lines of the run say the rest."""
 
     def __init__(self, meter: SweepMeter, output: Output, title: str, duration_s: float) -> None:

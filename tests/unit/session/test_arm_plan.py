@@ -32,7 +32,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import Hold
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_buses
-from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
+from jointctl.tools.session.display import Display, JointDisplay, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
@@ -211,14 +211,14 @@ def test_each_joint_sees_its_own_records_and_how_many_it_lost(cycles: int) -> No
 def test_of_an_arms_display_each_joint_has_its_name_and_the_first_one_the_phase() -> None:
     said: list[str] = []
 
-    class Lines(OnlyShows):
+    class Lines(Display):
         note = phase = said.append
 
         def event(self, event: Event) -> None:
             said.append(event.text)
 
     for number, name in enumerate(NAMES[:2]):
-        shown = JointDisplay(Lines(), name, [], number)  # type: ignore[arg-type]
+        shown = JointDisplay(Lines(), name, [], number)
         shown.phase("tracking")
         shown.note("a remark")
         shown.event(Event(0, INFO, "loop", "an event"))
@@ -231,14 +231,14 @@ def test_a_program_moves_each_joint_viewers_none() -> None:
         *(PreparedMotion("motion", "the program", joint=name) for name in reversed(NAMES)),
     ]  # fmt: skip
 
-    class Asking(OnlyShows):
+    class Asking(Display):
         def requests(self) -> list[ViewerRequest]:
             taken = list(waiting)
             waiting.clear()
             return taken
 
     orders: list[ViewerRequest] = []
-    shown = [JointDisplay(Asking(), name, orders, axis) for axis, name in enumerate(NAMES)]  # type: ignore[arg-type]
+    shown = [JointDisplay(Asking(), name, orders, axis) for axis, name in enumerate(NAMES)]
     taken = [[(each.kind, getattr(each, "joint", "")) for each in one.requests()] for one in shown]
     assert taken == [[("viewers", ""), ("motion", "shoulder")], [("motion", "elbow")], [("motion", "wrist")]]
     assert not orders
