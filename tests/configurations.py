@@ -30,15 +30,8 @@ def shipped(name: str = "virtual", **changes: Any) -> Config:
 
 
 def changed(config: Config, **changes: Any) -> Config:
-    """`section__key=value` changed, unchecked; a section as a whole by its name alone."""
-    update: dict[str, Any] = {}
-    for path, value in changes.items():
-        section, _, key = path.partition("__")
-        if key:
-            update[section] = update.get(section, getattr(config, section)).model_copy(update={key: value})
-        else:
-            update[section] = value
-    return config.model_copy(update=update)
+    """See `Config.changed`."""
+    return config.changed(**changes)
 
 
 def edited_file(folder: Path, *changes: tuple[str, str], base: str = "virtual") -> Path:

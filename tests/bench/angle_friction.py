@@ -57,10 +57,7 @@ def true_angle(ratio: float, random: np.random.Generator) -> FrictionAngle:
 
 def base_config() -> Config:
     config = load_config(shipped_config("precise"))
-    period = config.trajectory.model_copy(update={"duration_s": PERIOD_s})
-    return config.model_copy(
-        update={"control": config.control.model_copy(update={"learning": None}), "trajectory": period}
-    )
+    return config.changed(control__learning=None, trajectory__duration_s=PERIOD_s)
 
 
 def identified(config: Config, design: Design) -> MotionFit:
@@ -75,8 +72,7 @@ def identified(config: Config, design: Design) -> MotionFit:
 def believing(config: Config, friction: Friction, ripple: Ripple | None = None) -> Config:
     """With another section, whose bristles are those of the file, and the ripple that was found."""
     assert config.friction is not None
-    changed = friction.model_copy(update={"lugre": config.friction.lugre})
-    return config.model_copy(update={"friction": changed, "ripple": ripple})
+    return config.changed(friction=friction, ripple=ripple, friction__lugre=config.friction.lugre)
 
 
 def found_ripple(found: MotionFit) -> Ripple | None:
@@ -96,7 +92,7 @@ def random_joint(seed: int, index: int, design: Design) -> tuple[np.ndarray, str
     assert config.friction is not None
     angle = true_angle(config.joint.reduction_ratio, random)
     truth = config.friction.model_copy(update={"angle": angle})
-    config = config.model_copy(update={"virtual": config.virtual.model_copy(update={"friction": truth})})
+    config = config.changed(virtual__friction=truth)
     found = identified(config, design)
     section = Friction.model_validate(motion_section(found))
     believed = (
@@ -106,7 +102,7 @@ def random_joint(seed: int, index: int, design: Design) -> tuple[np.ndarray, str
     rows = []
     for changes in LAWS.values():
         for each in believed:
-            run = LockstepJoint(each.model_copy(update={"control": each.control.model_copy(update=changes)})).run()
+            run = LockstepJoint(each.changed(control=changes)).run()
             error_mrad = run.true_error_rad[run.tracking] * 1e3
             rows.append(
                 (np.inf, np.inf) if run.fault else (np.max(np.abs(error_mrad)), np.sqrt(np.mean(error_mrad**2)))

@@ -78,17 +78,16 @@ def random_arm(
             ensemble = ensemble.model_copy(update=exact)
         if not observer:
             alone = {"kind": "computed_torque", "observer_radps": 0.0, "observer_paired": False, "adaptation": None}
-            config = config.model_copy(update={"control": config.control.model_copy(update=alone)})
+            config = config.changed(control=alone)
         if not paired:
-            as_it_comes = {"observer_paired": False, "feed_forward_lead_s": 0.0015}
-            config = config.model_copy(update={"control": config.control.model_copy(update=as_it_comes)})
+            config = config.changed(control__observer_paired=False, control__feed_forward_lead_s=0.0015)
         if flexible:
             drawn = with_reducer(arm, number, ensemble, seed, index)
         else:
             drawn = random_plant(config, ensemble, seed, 100 * index + number)
         assert drawn.virtual is not None
         crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
-        joints.append(drawn.model_copy(update={"virtual": drawn.virtual.model_copy(update=crest)}))
+        joints.append(drawn.changed(virtual=crest))
     return replace(arm, joints=tuple(joints))
 
 
@@ -100,19 +99,16 @@ def with_reducer(arm: ArmConfig, number: int, ensemble: EnsembleSettings, seed: 
     ratio, size = base.joint.inertia_kgm2 / motor_kgm2 - 1.0, SIZES[number]
     soft = {"flexible": True, "inertia_ratio": (ratio, ratio), "flexible_inertia_scale": (1.0, 1.0)}
     ensemble = ensemble.model_copy(update=soft | {"reducer_sizes": (size,)})
-    drawn = random_plant(base.model_copy(update={"control": control}), ensemble, seed, 100 * index + number)
+    drawn = random_plant(base.changed(control=control), ensemble, seed, 100 * index + number)
     assert drawn.reducer is not None
     assert drawn.virtual is not None
     # the arm's model says what the controller believes of the inertias
     scale = float(np.random.default_rng([seed, index, number]).uniform(*ensemble.inertia_scale))
     true = {"motor_side_inertia_kgm2": motor_kgm2 * scale, "inertia_scale": scale}
-    believed = drawn.model_copy(update={
-        "joint": base.joint, "reducer": drawn.reducer.model_copy(update={"motor_inertia_kgm2": motor_kgm2}),
-        "virtual": drawn.virtual.model_copy(update=true),
-    })  # fmt: skip
+    believed = drawn.changed(joint=base.joint, reducer__motor_inertia_kgm2=motor_kgm2, virtual=true)
     poses = joint_loop(arm.names[number], believed, pose_ranges(arm)[number])
     gains = gains_of_file(poses.config, poses.settings)
-    return believed.model_copy(update={"control": control.model_copy(update=gains.changes())})
+    return believed.changed(control=control.model_copy(update=gains.changes()))
 
 
 def moving(arm: ArmConfig, speed: float) -> ArmConfig:
@@ -124,8 +120,8 @@ def moving(arm: ArmConfig, speed: float) -> ArmConfig:
             kind="sine", duration_s=DURATION_s, amplitude_rad=amplitude, frequency_Hz=frequency_Hz,
             shift_s=0.25 / frequency_Hz, offset_rad=offset,
         )  # fmt: skip
-        sequence = config.sequence.model_copy(update={"approach_s": 0.5})  # it stands there, and must gain acceleration
-        joints.append(config.model_copy(update={"trajectory": sine, "sequence": sequence}))
+        # it stands there, and must gain acceleration
+        joints.append(config.changed(trajectory=sine, sequence__approach_s=0.5))
     return replace(arm, joints=tuple(joints))
 
 

@@ -130,12 +130,7 @@ def client_rows(
     config = load_config(shipped_config("virtual"))
     # the program waits for a client that starts
     patient = {"delay_s": STREAM_DELAY_S, "timeout_s": STREAM_TIMEOUT_S, "client_timeout_s": 60.0}
-    config = config.model_copy(
-        update={
-            "stream": config.stream.model_copy(update=patient),
-            "loop": config.loop.model_copy(update={"cpu": loop_cpu}),
-        }
-    )
+    config = config.changed(stream=patient, loop__cpu=loop_cpu)
     port = free_port()
     at = f"127.0.0.1:{port}"
     costs: list[list[np.ndarray]] = []

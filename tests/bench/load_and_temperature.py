@@ -65,52 +65,35 @@ WARM_UP_s = 300.0
 def base_config() -> Config:
     """`precise` without learning, a pendulum on the joint, and a drive that reports its temperature."""
     config = load_config(shipped_config("precise"))
-    assert config.virtual is not None
-    drive = {"temperature_object": "2103", "temperature_unit_degC": 0.1}
-    limits = {"position_min_rad": -3.0, "position_max_rad": 3.0}
-    return config.model_copy(
-        update={
-            "control": config.control.model_copy(update={"learning": None}),
-            "joint": config.joint.model_copy(update={"gravity_Nm": PENDULUM_Nm}),
-            "drive": config.drive.model_copy(update=drive),
-            "limits": config.limits.model_copy(update=limits),
-            "virtual": config.virtual.model_copy(update={"gravity_Nm": PENDULUM_Nm}),
-            "trajectory": config.trajectory.model_copy(
-                update={"amplitude_rad": AMPLITUDE_rad, "frequency_Hz": 1.0 / PERIOD_s, "duration_s": PERIOD_s}
-            ),
-        }
-    )
+    return config.changed(
+        control__learning=None, joint__gravity_Nm=PENDULUM_Nm, virtual__gravity_Nm=PENDULUM_Nm,
+        drive={"temperature_object": "2103", "temperature_unit_degC": 0.1},
+        limits={"position_min_rad": -3.0, "position_max_rad": 3.0},
+        trajectory={"amplitude_rad": AMPLITUDE_rad, "frequency_Hz": 1.0 / PERIOD_s, "duration_s": PERIOD_s},
+    )  # fmt: skip
 
 
 def true_terms(config: Config, random: np.random.Generator, **virtual: Any) -> tuple[Config, Friction]:
     """The joint with friction that goes with load and temperature, which the controller knows nothing of; the truth."""
     assert config.friction is not None
-    assert config.virtual is not None
     truth = config.friction.model_copy(update={
         "load": FrictionLoad(coulomb=random.uniform(0.03, 0.2), viscous_spr=random.uniform(0.0, 0.1)),
         "temperature": FrictionTemperature(
             reference_degC=25.0, coulomb_pK=random.uniform(0.002, 0.008), viscous_pK=random.uniform(0.01, 0.03)
         ),
     })  # fmt: skip
-    return config.model_copy(
-        update={"virtual": config.virtual.model_copy(update={"friction": truth, **virtual})}
-    ), truth
+    return config.changed(virtual={"friction": truth, **virtual}), truth
 
 
 def believing(config: Config, friction: Friction) -> Config:
     """With another curve and terms; its bristles stay."""
-    assert config.friction is not None
     names = ("velocity_unit", "velocity_side", "torque_side", "positive", "negative", "load", "temperature")
-    changed = config.friction.model_copy(update={name: getattr(friction, name) for name in names})
-    return config.model_copy(update={"friction": changed})
+    return config.changed(friction={name: getattr(friction, name) for name in names})
 
 
 def excited(config: Config, design: Design, degC: float, folder: Path) -> Path:
     """The log of the designed motion at a temperature."""
-    assert config.virtual is not None
-    virtual = config.virtual.model_copy(update={"ambient_degC": degC})
-    log = config.log.model_copy(update={"folder": str(folder)})
-    moving = config_of_sweep(config.model_copy(update={"virtual": virtual, "log": log}), "torque")
+    moving = config_of_sweep(config.changed(virtual__ambient_degC=degC, log__folder=str(folder)), "torque")
     path = lockstep_log(moving, ExcitePass(moving, design), TerminalConsent(Output(quiet=True), assume_yes=True))
     assert path is not None
     return path
@@ -147,14 +130,11 @@ def random_joint(seed: int, index: int, design: Design, *, quiet: bool, kept: Pa
     random = np.random.default_rng([seed, index, 1])
     config, truth = true_terms(random_plant(base_config(), settings, seed, index), random)
     found = identified(config, design, random, kept)
-    assert config.virtual is not None
-    virtual = config.virtual.model_copy(update={"ambient_degC": float(random.uniform(15.0, 55.0))})
-    config = config.model_copy(update={"virtual": virtual})
+    config = config.changed(virtual__ambient_degC=float(random.uniform(15.0, 55.0)))
     rows = []
     for changes in LAWS.values():
         for believed in (config, believing(config, found), believing(config, truth)):
-            control = believed.control.model_copy(update=changes)
-            run = LockstepJoint(believed.model_copy(update={"control": control})).run()
+            run = LockstepJoint(believed.changed(control=changes)).run()
             rows.append(errors(run, 0.0, PERIOD_s) if not run.fault else (np.inf, np.inf))
     return np.array(rows).reshape(len(LAWS), len(MODELS), 2)
 
@@ -164,13 +144,10 @@ def warm_up(design: Design) -> list[tuple[str, float, float, float]]:
     random = np.random.default_rng(7)
     heating = {"ambient_degC": 20.0, "thermal": True, "thermal_time_s": 100.0, "heating_KpA2": 6.0}
     config, _ = true_terms(base_config(), random)
-    assert config.virtual is not None
     believed = believing(config, identified(config, design, random))
-    trajectory = config.trajectory.model_copy(update={"duration_s": WARM_UP_s})
     rows = []
     for name, each in (("today's model", config), ("identified", believed)):
-        virtual = each.virtual.model_copy(update=heating)  # type: ignore[union-attr]
-        run = LockstepJoint(each.model_copy(update={"trajectory": trajectory, "virtual": virtual})).run()
+        run = LockstepJoint(each.changed(trajectory__duration_s=WARM_UP_s, virtual=heating)).run()
         periods = [errors(run, at_s, at_s + PERIOD_s)[1] for at_s in np.arange(PERIOD_s, WARM_UP_s, PERIOD_s)]
         whole = errors(run, PERIOD_s, WARM_UP_s)[1] if not run.fault else np.inf
         rows.append((name, float(run.plant.motor_temperature_degC), whole, max(periods)))

@@ -125,15 +125,13 @@ def wrong_guess(config: Config, seed: int, index: int) -> Config:
     inertia, friction = (float(math.exp(random.uniform(-math.log(2.0), math.log(2.0)))) for _ in range(2))
     assert config.virtual is not None
     assert config.friction is not None
-    virtual = {"inertia_scale": config.virtual.inertia_scale / inertia, "friction": config.friction}
-    update: dict[str, Any] = {
-        "joint": config.joint.model_copy(update={"inertia_kgm2": inertia * config.joint.inertia_kgm2}),
-        "friction": scaled(config.friction, friction, friction),
-        "virtual": config.virtual.model_copy(update=virtual),
-        "margin": config.margin.model_copy(update={"loop_delay_s": None, "current_lag_s": 0.0005}),
-        "reducer": None,
-    }
-    return config.model_copy(update=update)
+    return config.changed(
+        joint__inertia_kgm2=inertia * config.joint.inertia_kgm2,
+        friction=scaled(config.friction, friction, friction),
+        virtual={"inertia_scale": config.virtual.inertia_scale / inertia, "friction": config.friction},
+        margin={"loop_delay_s": None, "current_lag_s": 0.0005},
+        reducer=None,
+    )
 
 
 def true_fit(config: Config, found: JointFit, true_kgm2: float, local: tuple[float, float, float]) -> JointFit:
@@ -234,8 +232,7 @@ def local_reducer(config: Config, true_kgm2: float, carrier: Timed) -> tuple[flo
 
 def rmse_mrad(config: Config) -> tuple[float, float]:
     """Of the link itself, before and after `LATE_s`; nan where a fault ended the run."""
-    trajectory = config.trajectory.model_copy(update={"duration_s": RUN_s})
-    run = LockstepJoint(config.model_copy(update={"trajectory": trajectory})).run()
+    run = LockstepJoint(config.changed(trajectory__duration_s=RUN_s)).run()
     if run.fault:
         return math.nan, math.nan
     time_s, error_mrad = run.log.trajectory_s, 1e3 * run.true_error_rad
@@ -249,8 +246,7 @@ def unloaded(plant: Config, seed: int, index: int) -> Config:
     random = np.random.default_rng([seed, index, 7])
     inertia, factor = math.exp(random.uniform(*np.log(LIGHT_kgm2))), float(random.uniform(*LIGHT_FRICTION))
     assert plant.friction is not None
-    joint = plant.joint.model_copy(update={"inertia_kgm2": inertia})
-    return plant.model_copy(update={"joint": joint, "friction": scaled(plant.friction, factor, factor)})
+    return plant.changed(joint__inertia_kgm2=inertia, friction=scaled(plant.friction, factor, factor))
 
 
 def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
@@ -262,7 +258,7 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     if kind == "light":
         plant = unloaded(plant, seed, index)
     if encoders == "motor":
-        plant = plant.model_copy(update={"joint_encoder": None})
+        plant = plant.changed(joint_encoder=None)
     assert plant.virtual is not None
     true_kgm2 = plant.joint.inertia_kgm2 * plant.virtual.inertia_scale
     guess = wrong_guess(plant, seed, index)
@@ -316,9 +312,9 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     known = with_values(job.config, values_of_fit(job.config, truth, ""))
     assert plant.friction is not None
     friction = scaled(plant.friction, virtual.friction_positive_scale, virtual.friction_negative_scale)
-    known = known.model_copy(update={"friction": friction})
+    known = known.changed(friction=friction)
     best = choose_gains(known, truth.intervals(), row["law"])
-    row["rmse_true_mrad"], row["late_rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
+    row["rmse_true_mrad"], row["late_rmse_true_mrad"] = rmse_mrad(known.changed(control=best.control))
     if motions:
         control = job.config.control.model_copy(update={"learning": None, "adaptation": None})
         chosen = Controller("tuned", control, job.config.friction)

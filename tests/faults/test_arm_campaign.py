@@ -116,7 +116,7 @@ def test_no_scenario_violates_an_invariant_with_other_arms(arm: ArmConfig, tmp_p
 
 
 def test_a_joint_without_a_brake_that_friction_does_not_hold_has_no_envelope(arm: ArmConfig) -> None:
-    loose = arm.joints[0].model_copy(update={"virtual": arm.joints[0].virtual.model_copy(update={"brake": False})})
+    loose = arm.joints[0].changed(virtual__brake=False)
     with pytest.raises(ConfigurationError, match=r"gravity at shoulder \(=\d+\.\d+ Nm\) must be less than \d+\.\d+ Nm"):
         require_arm_fits(dataclasses.replace(arm, joints=(loose, *arm.joints[1:])))
 
@@ -350,8 +350,6 @@ def test_what_is_one_joints_is_refused_and_so_is_an_arm_that_proves_nothing(arm:
     shown, _, _ = output()
     with pytest.raises(UsageError, match=r"--sweep is one joint's, and .*arm.toml is an arm"):
         fault_campaign(arm, shown, during="sweep")
-    slow = arm.joints[1].model_copy(
-        update={"limits": arm.joints[1].limits.model_copy(update={"velocity_max_radps": 0.9})}
-    )
+    slow = arm.joints[1].changed(limits__velocity_max_radps=0.9)
     with pytest.raises(ConfigurationError, match=r"elbow.toml: limits.velocity_max_radps \(=0.9\) must be at least 1"):
         require_arm_fits(dataclasses.replace(arm, joints=(arm.joints[0], slow, arm.joints[2])))

@@ -103,7 +103,7 @@ def test_a_study_on_a_cluster_is_the_one_of_this_computer(cluster: Cluster) -> N
         cluster.worker(name)
     cluster.wait_for(2)
     base = load_config(shipped_config("precise"))
-    base = base.model_copy(update={"trajectory": base.trajectory.model_copy(update={"duration_s": 3.0})})
+    base = base.changed(trajectory__duration_s=3.0)
     results = [
         run_study(base, named(("paper", "pid")), StudySettings(plants=5, seed=4, after_s=1.0), workers=workers)
         for workers in (Workers(cluster=cluster.address), Workers(1))

@@ -26,8 +26,7 @@ def own_loop(mode: str, **cascade: Any) -> Config:
     drive = config.drive
     assert isinstance(drive, CanopenSection)
     assert drive.cascade is not None
-    kept = drive.cascade.model_copy(update=cascade)
-    return config.model_copy(update={"drive": drive.model_copy(update={"mode": mode, "cascade": kept})})
+    return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
 
 
 @pytest.fixture(scope="module", params=["csp", "csv"])

@@ -100,7 +100,7 @@ def test_a_stop_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, r
 def test_a_failed_supervisor_of_an_arm_waits_for_its_slowest_joint(virtual_config: Any, slow: bool) -> None:
     """Not for the first one's time: that took the others out of their ramps.  The twin has no slow one."""
     at_once = dict.fromkeys(("stop_timeout_s", "release_s", "off_timeout_s"), 0.0)
-    quick = virtual_config.model_copy(update={"sequence": virtual_config.sequence.model_copy(update=at_once)})
+    quick = virtual_config.changed(sequence=at_once)
     assert (braked([quick, virtual_config if slow else quick]).polls == 0) is slow
 
 

@@ -99,7 +99,7 @@ def test_loaded_plants_are_the_same_but_for_pendulum_temperature_and_what_fricti
     assert with_plants(StudySettings(), ["loaded"]).plant.loaded
     assert not with_plants(StudySettings(), ["loaded", "realistic"]).plant.loaded
     with pytest.raises(ConfigurationError, match=r"plant.loaded \(=true\) needs \[friction\]"):
-        random_plant(base.model_copy(update={"friction": None}), loaded, 4, 0)
+        random_plant(base.changed(friction=None), loaded, 4, 0)
 
 
 # --- running ---

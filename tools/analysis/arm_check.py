@@ -226,15 +226,14 @@ def require_torques(
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:
     """Margins of a joint's loop with the least and the greatest inertia; of a flexible one the link's goes with it."""
     reducer, inertia = config.reducer, config.joint.inertia_kgm2
-    held = config.joint.model_copy(update={"gravity_Nm": found.gravity_Nm})  # the arm's, in the worst pose
-    config = config.model_copy(update={"joint": held})
+    config = config.changed(joint__gravity_Nm=found.gravity_Nm)  # the arm's, in the worst pose
     ends = found.least_kgm2, found.greatest_kgm2
     if reducer is not None:
         motor = reducer.motor_inertia_kgm2
         low, high = ((end - motor) / (inertia - motor) for end in ends)
         known = config.margin.payload_range  # what a single joint must bear, besides
         factors = min(low, known[0]), max(high, known[1])
-        config = config.model_copy(update={"margin": config.margin.model_copy(update={"payload_range": factors})})
+        config = config.changed(margin__payload_range=factors)
         settings, _ = loop_settings(config, delay_s)
     else:
         settings, _ = loop_settings(config, delay_s)

@@ -387,7 +387,7 @@ def _moved(path: Path, motion: ArmTrajectory, alone: tuple[Config, ...], names: 
             if not file.is_file():
                 raise_if([f"{path}: motion.file (={part.file}) must name a file beside the arm file"])
             part = part.model_copy(update={"file": str(file)})
-        one = config.model_copy(update={"trajectory": part})
+        one = config.changed(trajectory=part)
         wrong += [f"{path}: with [motion], {config.path.name}: {line}" for line in problems_between_sections(one)]
         joints.append(one)
     raise_if(wrong)

@@ -127,13 +127,13 @@ class CanopenSection(DriveSection):
         """Flag beats environment (CAN_INTERFACE, CAN_CHANNEL, CAN_BITRATE) beats file."""
         if given.port is not None:
             raise wrong_kind(config.path, self.kind, FOR_A_PORT)
-        config = config.model_copy(update={"bus": _moved_bus(config.bus, given, environ)})
+        config = config.changed(bus=_moved_bus(config.bus, given, environ))
         if given.node is None:
             return config
         node: object = given.node  # of a program it may be anything
         if not isinstance(node, Integral) or isinstance(node, bool) or not 1 <= int(node) <= HIGHEST_NODE:
             raise ConfigurationError(f"command line: node (={node}) must be a whole number in [1..{HIGHEST_NODE}]")
-        config = config.model_copy(update={"drive": self.model_copy(update={"node": int(node)})})
+        config = config.changed(drive__node=int(node))
         if found := node_problems(config):
             raise ConfigurationProblems([f"command line: {line}" for line in found])
         return config

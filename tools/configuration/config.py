@@ -163,10 +163,19 @@ class Config(Section):
     def path(self) -> Path:
         return self._path
 
+    def changed(self, **changes: Any) -> Config:
+        """With `section__key=value`, or `section=` the keys of a mapping or another section; nothing is checked."""
+        update: dict[str, Any] = {}
+        for path, value in changes.items():
+            section, _, key = path.partition("__")
+            keys = {key: value} if key else value
+            own = update.get(section, getattr(self, section))
+            update[section] = own.model_copy(update=keys) if isinstance(keys, Mapping) else value
+        return self.model_copy(update=update)
+
     def anchored(self) -> Config:
         """The same wherever the working directory goes: its file and its log folder by their full paths."""
-        folder = str(Path(self.log.folder).absolute())
-        found = self.model_copy(update={"log": self.log.model_copy(update={"folder": folder})})
+        found = self.changed(log__folder=str(Path(self.log.folder).absolute()))
         found._path = self._path.absolute()
         return found
 

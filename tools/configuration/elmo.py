@@ -106,8 +106,7 @@ class ElmoSection(DriveSection):
             raise wrong_kind(config.path, self.kind, FOR_A_NODE)
         if given.port is None:
             return config
-        drive, bus = self.model_copy(update={"port": given.port}), {"channel": given.port}
-        return config.model_copy(update={"drive": drive, "bus": config.bus.model_copy(update=bus)})
+        return config.changed(drive__port=given.port, bus__channel=given.port)
 
     def assumed_delay(self, config: Config) -> tuple[float, str]:
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"

@@ -127,17 +127,12 @@ def rounded(value: float) -> float:
 
 def with_values(config: Config, values: list[Found]) -> Config:
     """The configuration in use with these values; the virtual joint stays what it was."""
-    sections: dict[str, dict[str, Any]] = {}
+    sections: dict[str, Any] = {}
     for one in values:
         sections.setdefault(one.section[0], {})[one.key] = one.value
-    update: dict[str, Any] = {}
-    for name, keys in sections.items():
-        own = getattr(config, name)
-        if own is None and name == "reducer":
-            update[name] = Reducer(**keys)
-        else:
-            update[name] = own.model_copy(update=keys)
-    return _same_plant(config, config.model_copy(update=update))
+    if config.reducer is None and "reducer" in sections:
+        sections["reducer"] = Reducer(**sections["reducer"])
+    return _same_plant(config, config.changed(**sections))
 
 
 def _same_plant(before: Config, after: Config) -> Config:
@@ -146,21 +141,18 @@ def _same_plant(before: Config, after: Config) -> Config:
         return after
     scale = virtual.inertia_scale * before.joint.inertia_kgm2 / after.joint.inertia_kgm2
     kept = {"inertia_scale": scale, "friction": virtual.friction or before.friction}
-    return after.model_copy(update={"virtual": virtual.model_copy(update=kept)})
+    return after.changed(virtual=kept)
 
 
 def with_friction(config: Config, section: Mapping[str, Any]) -> Config:
     """The configuration in use with the friction that was identified; what it knew of bristles stays."""
     lugre = config.friction.lugre if config.friction is not None else None
-    return _same_plant(
-        config, config.model_copy(update={"friction": Friction.model_validate({**section, "lugre": lugre})})
-    )
+    return _same_plant(config, config.changed(friction=Friction.model_validate({**section, "lugre": lugre})))
 
 
 def without_friction(config: Config) -> Config:
     """The configuration in use before the friction is known."""
-    control = config.control.model_copy(update={"feed_forward": "none", "adaptation": None})
-    return _same_plant(config, config.model_copy(update={"friction": None, "control": control}))
+    return _same_plant(config, config.changed(friction=None, control__feed_forward="none", control__adaptation=None))
 
 
 def with_break_away(config: Config, torque_Nm: float) -> Config:
@@ -169,7 +161,7 @@ def with_break_away(config: Config, torque_Nm: float) -> Config:
     Nothing of it is fed forward.  A joint that is pushed harder and does not move has an encoder that stands still.
     """
     friction = _straight(torque_Nm, (torque_Nm, torque_Nm), 0.0)
-    return without_friction(config).model_copy(update={"friction": friction})
+    return without_friction(config).changed(friction=friction)
 
 
 def with_sliding(
@@ -185,8 +177,7 @@ def with_sliding(
     coulomb = (sizes[0] - speed_radps * slope_Nmspr, sizes[1] - speed_radps * slope_Nmspr)
     friction = _straight(torque_Nm, coulomb, slope_Nmspr)
     before = with_break_away(config, torque_Nm)
-    control = before.control.model_copy(update={"feed_forward": "desired"})
-    return before.model_copy(update={"friction": friction, "control": control})
+    return before.changed(friction=friction, control__feed_forward="desired")
 
 
 def _straight(static_Nm: float, coulomb_Nm: tuple[float, float], slope_Nmspr: float) -> Friction:

@@ -110,8 +110,7 @@ def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
 def free_constants(config: Config, start_rad: float) -> Any:
     """A record array of one `AxisConstants`: at rest at `start_rad`, for set-points; no one need be alive."""
     hold = Hold(kind="hold", duration_s=0.0, position_rad=start_rad)
-    sequence = config.sequence.model_copy(update={"approach_s": 0.0})
-    held = config.model_copy(update={"trajectory": hold, "sequence": sequence})
+    held = config.changed(trajectory=hold, sequence__approach_s=0.0)
     constants = axis_constants(held, np.zeros((1, 5)), start_position_rad=start_rad)
     constants[0].trajectory.kind = TrajectoryKind.STREAM
     return constants

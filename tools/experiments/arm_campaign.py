@@ -218,11 +218,8 @@ def moving(arm: ArmConfig, scenario: ArmScenario) -> ArmConfig:
     """The arm with the scenario's motions and inertias."""
     joints = []
     for config, joint, scale in zip(arm.joints, scenario.joints, scenario.inertia_scales, strict=True):
-        assert config.virtual is not None
-        sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
-        virtual = config.virtual.model_copy(update={"inertia_scale": scale})
-        changed = {"trajectory": joint.trajectory, "sequence": sequence, "virtual": virtual}
-        joints.append(config.model_copy(update=changed))
+        shown = {"trajectory": joint.trajectory, "sequence__approach_s": APPROACH_s}
+        joints.append(config.changed(**shown, virtual__inertia_scale=scale))
     return replace(arm, joints=tuple(joints))
 
 

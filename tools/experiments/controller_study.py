@@ -275,8 +275,8 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
     bits = int(random.integers(settings.encoder_bits[0], settings.encoder_bits[1] + 1))
     assert base.virtual is not None
     update: dict[str, Any] = {
-        "drive": base.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
-        "encoder": base.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": "joint"}),
+        "drive__rpdo_transmission_type": RPDO_AT_ONCE,
+        "encoder": {"counts_per_turn": 2**bits, "side": "joint"},
     }
     if settings.flexible:
         virtual |= _flexible(base, settings, random)
@@ -285,7 +285,7 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         if settings.law == "joint_encoder_alone":
             update["joint_encoder"] = None
         else:
-            update["encoder"] = base.encoder.model_copy(update=motor)
+            update["encoder"] = motor
             update["joint_encoder"] = JointEncoder(
                 source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,
                 disagreement_max_rad=ENCODERS_APART_rad,
@@ -294,16 +294,13 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         update["reducer"], link_kgm2 = _belief(base, true, settings, random)
         believed_kgm2 = update["reducer"].motor_inertia_kgm2 + link_kgm2
         virtual["inertia_scale"] *= base.joint.inertia_kgm2 / believed_kgm2
-        update["joint"] = base.joint.model_copy(update={"inertia_kgm2": believed_kgm2})
+        update["joint__inertia_kgm2"] = believed_kgm2
     delay_s = virtual["command_delay_s"] + float(random.uniform(-DELAY_ERROR_s, DELAY_ERROR_s))
-    measured = {"loop_delay_s": max(delay_s, 0.0), "current_lag_s": virtual["current_lag_s"]}
-    update["margin"] = base.margin.model_copy(update=measured)
+    update["margin"] = {"loop_delay_s": max(delay_s, 0.0), "current_lag_s": virtual["current_lag_s"]}
     if settings.loaded:  # drawn by themselves: the rest of the plant is the same with and without
         virtual |= _loaded(base, settings, np.random.default_rng([seed, index, 1]))
-        joint = update.get("joint", base.joint)
-        update["joint"] = joint.model_copy(update={"gravity_Nm": virtual["gravity_Nm"]})
-    update["virtual"] = base.virtual.model_copy(update=virtual)
-    return base.model_copy(update=update)
+        update["joint__gravity_Nm"] = virtual["gravity_Nm"]
+    return base.changed(**update, virtual=virtual)
 
 
 # --- what is compared ---

@@ -123,8 +123,8 @@ def controller_config(base: Config, controller: Controller) -> Config:
             )
         cascade = canopen_section(base).cascade
         assert cascade is not None
-        update["drive"] = drive.model_copy(update={"cascade": cascade.model_copy(update=dict(controller.cascade))})
-    config = base.model_copy(update=update)
+        update["drive__cascade"] = cascade.model_copy(update=dict(controller.cascade))
+    config = base.changed(**update)
     problems = problems_between_sections(config)
     if problems:
         raise ConfigurationError(f"controller {controller.name}: {problems[0]}")

@@ -307,7 +307,7 @@ class Program:
 
 def set_points_of(program: Program, config: Config, table: np.ndarray) -> np.ndarray:
     """Rows of `hil.lockstep.Scenario.set_points`: at rest for `BEFORE_s`, then the trajectory, from rest to rest."""
-    shown = config.model_copy(update={"trajectory": program.trajectory})
+    shown = config.changed(trajectory=program.trajectory)
     trajectory, at = new(TrajectoryConstants)[0], new(Reference)[0]
     fill_trajectory(trajectory, shown, table)
     lasts_s = program.trajectory.duration_s

@@ -334,8 +334,7 @@ def run_scenario(
         expect_client(constants, config)
         lasts_s = float(points[-1, POINT_TIME_s]) + AFTER_s
         return _carry_out(joint, scenario, constants, lasts_s, plant_of(config, scenario, start), points)
-    sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
-    shown = config.model_copy(update={"trajectory": scenario.trajectory, "sequence": sequence})
+    shown = config.changed(trajectory=scenario.trajectory, sequence__approach_s=APPROACH_s)
     first = new(Reference)
     reference_at(axis_constants(shown, joint.table)[0].trajectory, joint.table, 0, 0.0, first[0])
     limits = config.limits

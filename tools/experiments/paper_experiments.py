@@ -84,17 +84,12 @@ def ideal(friction_kind: str, positive: float = 1.0, negative: float = 1.0) -> C
         "current_lag_s": 0.0,
         "command_delay_s": 0.0,
     }
-    return config.model_copy(
-        update={
-            "virtual": config.virtual.model_copy(update=virtual),
-            "drive": config.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
-        }
-    )
+    return config.changed(virtual=virtual, drive__rpdo_transmission_type=RPDO_AT_ONCE)
 
 
 def _at_once(config: Config) -> Config:
     """Without an approach: the run begins with the velocity error that a joint at rest has on a sine."""
-    return config.model_copy(update={"sequence": config.sequence.model_copy(update={"approach_s": 0.0})})
+    return config.changed(sequence__approach_s=0.0)
 
 
 def law(name: str, **changes: Any) -> Controller:

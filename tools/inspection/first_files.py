@@ -563,7 +563,7 @@ def _gain_keys(gains: tuple[float, float]) -> dict[str, float]:
 
 
 def _with(config: Config, gains: tuple[float, float]) -> Config:
-    return config.model_copy(update={"control": config.control.model_copy(update=_gain_keys(gains))})
+    return config.changed(control=_gain_keys(gains))
 
 
 def _bears(loop: JointOfArm) -> bool:

@@ -135,21 +135,16 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
     """The configuration with the limits and the law of the check; the drive's own torque limit follows from it."""
     require_torque(config, "the motion check")
-    limits = config.limits.model_copy(
-        update={
-            "torque_max_Nm": plan.torque_Nm,
-            "velocity_max_radps": plan.velocity_radps,
-            "following_error_max_rad": 1.25 * plan.travel_rad,
-        }
-    )
+    limits = {
+        "torque_max_Nm": plan.torque_Nm, "velocity_max_radps": plan.velocity_radps,
+        "following_error_max_rad": 1.25 * plan.travel_rad,
+    }  # fmt: skip
     kp = SPRING_SHARE * plan.spring_Nm / plan.travel_rad / config.joint.inertia_kgm2
-    law = {
+    control = {
         "kind": "computed_torque", "kp": kp, "kv": 2.0 * DAMPING * math.sqrt(kp), "feed_forward": "none",
         "learning": None,
     }  # fmt: skip
-    control = config.control.model_copy(update=law)
-    drive = config.drive.free_of_torque_limit()
-    return config.model_copy(update={"limits": limits, "control": control, "drive": drive})
+    return config.changed(limits=limits, control=control, drive=config.drive.free_of_torque_limit())
 
 
 def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
@@ -209,7 +204,7 @@ class CheckMotion:
     def constants(self, report: CommissioningReport, table: np.ndarray) -> Any:
         """`AxisConstants` of the check along `table`."""
         config, plan, start_rad = self.config, self.plan, report.start_position_rad
-        hold = config.model_copy(update={"sequence": config.sequence.model_copy(update={"approach_s": APPROACH_MIN_S})})
+        hold = config.changed(sequence__approach_s=APPROACH_MIN_S)
         constants = axis_constants(hold, table, start_position_rad=start_rad)
         axis = constants[0]
         axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0

@@ -41,7 +41,7 @@ STEPS = 8  # of the straight line from the gains in force to the new ones
 
 def with_gains(config: Config, gains: Mapping[str, float]) -> Config:
     """The configuration as if it had these numbers in [control]."""
-    return config.model_copy(update={"control": config.control.model_copy(update=dict(gains))})
+    return config.changed(control=dict(gains))
 
 
 def require_change(
@@ -107,7 +107,7 @@ def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> 
     trajectory = _trajectory(config, values)
     constants = new(TrajectoryConstants)
     record: Any = constants[0]
-    fill_trajectory(record, config.model_copy(update={"trajectory": trajectory}), table)
+    fill_trajectory(record, config.changed(trajectory=trajectory), table)
     if record.kind == TrajectoryKind.SINE:
         record.shift_s, record.switch_s = 0.5 * math.pi / record.omega_radps, 0.0
     return constants, checked_motion(config, record, table)

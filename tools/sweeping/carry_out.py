@@ -281,7 +281,7 @@ def with_mode(config: Config, mode: str) -> Config:
     """The configuration in the wanted mode: auto, csv, pv, speed (serial drive), or torque (as [drive] says)."""
     if mode not in MODES:
         raise UsageError(f"--mode (={mode}) must be one of {', '.join(MODES)}")
-    return config.model_copy(update={"drive": config.drive.in_sweep_mode(mode)})
+    return config.changed(drive=config.drive.in_sweep_mode(mode))
 
 
 def config_of_sweep(config: Config, mode: str) -> Config:
@@ -291,12 +291,9 @@ def config_of_sweep(config: Config, mode: str) -> Config:
 
 def with_tracking_law(config: Config) -> Config:
     """For torque mode: a law that holds a speed against unknown friction; one with integral action is kept."""
-    control = config.control
-    if control.kind in ("pid", "computed_torque_observer", "flexible_joint"):
-        update: dict[str, Any] = {"learning": None}
-    else:
-        update = {"kind": "computed_torque_observer", "observer_radps": OBSERVER_radps, "learning": None}
-    return config.model_copy(update={"control": control.model_copy(update=update)})
+    if config.control.kind not in ("pid", "computed_torque_observer", "flexible_joint"):
+        config = config.changed(control__kind="computed_torque_observer", control__observer_radps=OBSERVER_radps)
+    return config.changed(control__learning=None)
 
 
 def middle_rad(config: Config, motion: SweepMotion, start_rad: float) -> float:

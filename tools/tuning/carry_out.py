@@ -179,8 +179,7 @@ VERIFY_s = 30.0
 
 def with_motion(config: Config, motion: Trajectory) -> Config:
     """With an approach from wherever the step before has left the joint."""
-    sequence = config.sequence.model_copy(update={"approach_s": "auto"})
-    return config.model_copy(update={"trajectory": motion, "sequence": sequence})
+    return config.changed(trajectory=motion, sequence__approach_s="auto")
 
 
 def verifying_motion(config: Config) -> Trajectory:
@@ -274,7 +273,7 @@ def _with_chosen_gains(config: Config) -> Config:
     with contextlib.suppress(ConfigurationError):
         chosen = gains_of_file(config, loop_settings(config)[0])
         if chosen.best.stable and not chosen.missed:
-            return config.model_copy(update={"control": chosen.control})
+            return config.changed(control=chosen.control)
     return config
 
 
@@ -335,9 +334,7 @@ def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) 
         observer_radps = float(f"{radps:.3g}")
         slower = replace(settings, observer_radps=observer_radps)
         if meets(margins(slower), config.margin.min_phase_margin_deg):
-            return config.model_copy(
-                update={"control": config.control.model_copy(update={"observer_radps": observer_radps})}
-            )
+            return config.changed(control__observer_radps=observer_radps)
     return config
 
 

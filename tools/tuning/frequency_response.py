@@ -236,7 +236,7 @@ def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw
             own_Hz = config.control.velocity_cutoff_Hz or law.link_cutoff_Hz
             keys["velocity_cutoff_Hz"] = min(own_Hz, law.link_cutoff_Hz)
     config = with_mode(with_torque_limit(config, torque_Nm), "torque")
-    config = config.model_copy(update={"control": config.control.model_copy(update=keys)})
+    config = config.changed(control=keys)
     return config if law is None else motor_fed(config)
 
 
@@ -247,16 +247,14 @@ def with_torque_limit(config: Config, torque_Nm: float | None) -> Config:
         return config
     if not 0.0 < torque_Nm <= limits.torque_max_Nm:
         raise UsageError(f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm")
-    lowered = limits.model_copy(update={"torque_max_Nm": torque_Nm})
-    return config.model_copy(update={"limits": lowered, "drive": config.drive.free_of_torque_limit()})
+    return config.changed(limits__torque_max_Nm=torque_Nm, drive=config.drive.free_of_torque_limit())
 
 
 def motor_fed(config: Config) -> Config:
     """The configuration with a law that reads the motor's encoder, where there is one beside the link's."""
-    second = config.joint_encoder
-    if second is None or config.encoder.side != "motor":
+    if config.joint_encoder is None or config.encoder.side != "motor":
         return config
-    return config.model_copy(update={"joint_encoder": second.model_copy(update={"law": "encoder"})})
+    return config.changed(joint_encoder__law="encoder")
 
 
 @dataclass(frozen=True)

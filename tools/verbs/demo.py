@@ -80,13 +80,11 @@ def with_patience(config: Config) -> Config:
     from jointctl.tools.configuration.canopen import canopen_section
 
     longest_s = min(PATIENCE_S, 0.75 * canopen_section(config).heartbeat_s)
-    limits = config.limits
-    update = {key: max(getattr(limits, key), longest_s) for key in ("sample_age_max_s", "skipped_max_s")}
-    return config.model_copy(update={"limits": limits.model_copy(update=update)})
+    patient = {key: max(getattr(config.limits, key), longest_s) for key in ("sample_age_max_s", "skipped_max_s")}
+    return config.changed(limits=patient)
 
 
 def _with_duration(config: Config, duration_s: float) -> Config:
     if not duration_s <= LONGEST_S:
         raise ConfigurationError(f"--duration (={duration_s:g}) must be in [0.1..{LONGEST_S:g}] s")
-    trajectory = config.trajectory.model_copy(update={"duration_s": duration_s})
-    return config.model_copy(update={"trajectory": trajectory})
+    return config.changed(trajectory__duration_s=duration_s)

@@ -80,7 +80,7 @@ def with_eds(config: Config, eds: Path) -> Config:
     if not eds.is_file():
         raise ConfigurationError(f"--eds (={eds}) must name a file")
     drive = canopen_section(config).model_copy(update={"eds": str(eds.resolve()), "temperature_object": None})
-    return config.model_copy(update={"drive": drive})
+    return config.changed(drive=drive)
 
 
 def serve_can(

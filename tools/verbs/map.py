@@ -74,7 +74,7 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
         dwell_s=_DWELL_S, repeat=True,
     )  # fmt: skip
     torque = with_tracking_law(with_mode(config, "torque"))
-    return torque.model_copy(update={"trajectory": motion})
+    return torque.changed(trajectory=motion)
 
 
 def speeds_in_turn(config: Config) -> list[float]:

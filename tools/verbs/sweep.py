@@ -182,7 +182,7 @@ class Sweep:
         load_Nm = points[0].condition.load_Nm
         if options.lockstep and load_Nm and config.virtual is not None:
             carried = {"load_torque_Nm": config.virtual.load_torque_Nm + load_Nm}
-            config = config.model_copy(update={"virtual": config.virtual.model_copy(update=carried)})
+            config = config.changed(virtual=carried)
         swept = SweepPass(config, motion, points)
 
         def begin(report: CommissioningReport) -> None:

@@ -331,12 +331,11 @@ class Tune:
         return values_of_fit(self.original, self.fit, source)
 
     def _with_control(self, control: Control) -> Config:
-        update: dict[str, Any] = {"control": control}
-        second = self.config.joint_encoder
-        if second is not None and self.config.encoder.side == "motor":
+        config = self.config.changed(control=control)
+        if config.joint_encoder is not None and config.encoder.side == "motor":
             law = "joint_encoder" if control.kind == "flexible_joint" else "encoder"
-            update["joint_encoder"] = second.model_copy(update={"law": law})
-        return self.config.model_copy(update=update)
+            config = config.changed(joint_encoder__law=law)
+        return config
 
     def chosen_gains(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
@@ -429,7 +428,7 @@ class Tune:
         """Of a joint with two encoders and a soft reducer; nothing else has a use for it."""
         if self.config.reducer is None or self.config.joint_encoder is None:
             return {}
-        unmapped = self.config.model_copy(update={"reducer": self.config.reducer.model_copy(update={"map": None})})
+        unmapped = self.config.changed(reducer__map=None)
         speeds = speeds_in_turn(self.config)
         for speed_radps in speeds:
             moving = config_of_map(unmapped, MapOptions(speed_radps=speed_radps))
@@ -449,8 +448,7 @@ class Tune:
         self.carrier.output.note("  measured" if kept else "  none: it is for a soft reducer with two encoders")
         if kept and self.config.reducer is not None:
             values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in kept.items()}
-            reducer = self.config.reducer.model_copy(update={"map": ReducerMap(**values)})
-            self.config = self.config.model_copy(update={"reducer": reducer})
+            self.config = self.config.changed(reducer__map=ReducerMap(**values))
 
     # --- 6. gains ---
 
@@ -518,20 +516,18 @@ class Tune:
 
     def _before(self) -> Config:
         """The configuration as it was, on the joint that was found."""
-        joint = self.original.joint
-        control = self.original.control
-        update = {"control": control, "joint": joint, "friction": self.original.friction}
-        found = self.config.model_copy(update=update)
+        names = ("control", "joint", "friction", "reducer", "joint_encoder")
+        found = self.config.changed(**{name: getattr(self.original, name) for name in names})
         virtual = self.config.virtual
         if virtual is not None:
-            scale = virtual.inertia_scale * self.config.joint.inertia_kgm2 / joint.inertia_kgm2
-            found = found.model_copy(update={"virtual": virtual.model_copy(update={"inertia_scale": scale})})
-        return found.model_copy(update={"reducer": self.original.reducer, "joint_encoder": self.original.joint_encoder})
+            scale = virtual.inertia_scale * self.config.joint.inertia_kgm2 / found.joint.inertia_kgm2
+            found = found.changed(virtual__inertia_scale=scale)
+        return found
 
     def before_on_found(self) -> Config:
         """The law as it was, on everything that was found."""
         second = self.original.joint_encoder
-        return self.config.model_copy(update={"control": self.original.control, "joint_encoder": second})
+        return self.config.changed(control=self.original.control, joint_encoder=second)
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
         moving = with_motion(config, self.verifying)

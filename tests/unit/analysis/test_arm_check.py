@@ -48,23 +48,23 @@ def of(arm: ArmConfig, *joints: Config) -> ArmConfig:
 
 
 def at_rate(config: Config, rate_Hz: float) -> Config:
-    return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+    return config.changed(loop__rate_Hz=rate_Hz)
 
 
 def on_bus(config: Config, channel: str) -> Config:
-    return config.model_copy(update={"bus": config.bus.model_copy(update={"channel": channel})})
+    return config.changed(bus__channel=channel)
 
 
 def test_the_budgets_that_the_documentation_gives(arm: ArmConfig) -> None:
     one = arm.joints[0]
-    with_second = one.model_copy(update={"joint_encoder": SECOND})
+    with_second = one.changed(joint_encoder=SECOND)
     assert bus_budgets(arm)[0].load == pytest.approx(0.745)
     assert bus_budgets(of(arm, *[at_rate(one, 500.0)] * 7))[0].load == pytest.approx(0.8325)
     assert bus_budgets(of(arm, *[with_second] * 3))[0].load == pytest.approx(1.03)
 
 
 def test_a_bus_that_is_too_slow_is_refused_with_the_rate_that_fits(arm: ArmConfig) -> None:
-    with_second = arm.joints[0].model_copy(update={"joint_encoder": SECOND})
+    with_second = arm.joints[0].changed(joint_encoder=SECOND)
     with pytest.raises(ConfigurationError) as caught:
         require_budgets(of(arm, *[with_second] * 3))
     words = "bus virtual0: 3 joints (joint0, joint1, joint2) need 1030 bits a cycle, 103.0% of the bus"
@@ -86,7 +86,7 @@ def test_so_many_buses_as_are_needed_are_named(arm: ArmConfig, count: int, rate_
 
 
 def test_joints_on_two_buses_share_neither(arm: ArmConfig) -> None:
-    with_second = arm.joints[0].model_copy(update={"joint_encoder": SECOND})
+    with_second = arm.joints[0].changed(joint_encoder=SECOND)
     budgets = require_budgets(of(arm, with_second, on_bus(with_second, "other"), with_second))
     assert [(budget.channel, budget.bits) for budget in budgets] == [("virtual0", 705), ("other", 380)]
 
@@ -143,7 +143,7 @@ def test_each_joint_has_its_margin_in_the_worst_pose(arm: ArmConfig) -> None:
 def test_a_joint_that_swings_in_one_pose_is_refused(arm: ArmConfig) -> None:
     control = arm.joints[0].control
     quick = control.model_copy(update={"kp": 3.0 * control.kp, "kv": 1.8 * control.kv})
-    joints = (arm.joints[0].model_copy(update={"control": quick}), *arm.joints[1:])
+    joints = (arm.joints[0].changed(control=quick), *arm.joints[1:])
     with pytest.raises(MarginError) as caught:
         check(replace(arm, joints=joints), output()[0])
     assert str(caught.value).startswith("joint shoulder: ")
@@ -151,8 +151,7 @@ def test_a_joint_that_swings_in_one_pose_is_refused(arm: ArmConfig) -> None:
 
 
 def test_gravity_beyond_the_torque_is_refused(arm: ArmConfig) -> None:
-    weak = arm.joints[0].limits.model_copy(update={"torque_max_Nm": 30.0})
-    joints = (arm.joints[0].model_copy(update={"limits": weak}), *arm.joints[1:])
+    joints = (arm.joints[0].changed(limits__torque_max_Nm=30.0), *arm.joints[1:])
     with pytest.raises(ConfigurationError, match=r"joint shoulder: gravity reaches 32\.7 Nm"):
         joint_loops(replace(arm, joints=joints))
 
@@ -197,7 +196,7 @@ def test_the_files_of_an_arm_of_ones_own(tmp_path: Path) -> None:
 def test_a_flexible_joint_bears_the_links_of_its_poses(arm: ArmConfig) -> None:
     config = load_config(shipped_config("precise"))
     reducer = Reducer(motor_inertia_kgm2=1.2, stiffness_Nmprad=1e5)
-    flexible = config.model_copy(update={"reducer": reducer})
+    flexible = config.changed(reducer=reducer)
     for least, greatest, expected in ((1.65, 2.55, [0.45, 0.9, 1.35]), (2.1, 2.1, [0.63, 0.9, 1.26])):
         loop = joint_loop("one", flexible, PoseRange(least, greatest, 0.0))
         links = {joint.link_kgm2 for joint in loop.settings.joints if not isinstance(joint, RigidJoint)}

@@ -34,8 +34,7 @@ def own_loop(mode: str = "csp", **cascade: Any) -> Config:
     drive = config.drive
     assert isinstance(drive, CanopenSection)
     assert drive.cascade is not None
-    cascade_changed = drive.cascade.model_copy(update=cascade)
-    return config.model_copy(update={"drive": drive.model_copy(update={"mode": mode, "cascade": cascade_changed})})
+    return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
 
 
 def drive_of(config: Config) -> CanopenSection:
@@ -109,7 +108,7 @@ def soft_loop(side: str, mode: str = "csp", **cascade: float) -> Config:
     alone = {"margin__payload_range": (1.0, 1.0), "margin__stiffness_error": 0.0, "friction__lugre": None}
     config = changed(shipped("realistic"), joint_encoder=None, encoder__side=side, **alone)
     gains = {"velocity_gain_Nmspr": 150.0, "velocity_integral_Nmprad": 5000.0, "position_gain_ps": 20.0, **cascade}
-    return config.model_copy(update={"drive": own_loop(mode, **gains).drive})
+    return config.changed(drive=own_loop(mode, **gains).drive)
 
 
 @pytest.mark.parametrize("share", [0.97, 1.03])
@@ -139,7 +138,7 @@ def test_a_drive_that_closes_its_loops_over_a_soft_reducer_is_refused() -> None:
     shipped_one = shipped("realistic")
     stiff = own_loop("csv", velocity_gain_Nmspr=500.0, velocity_integral_Nmprad=40_000.0, position_gain_ps=50.0)
     with pytest.raises(MarginError, match="position loop"):  # which reads the link
-        require_cascade(shipped_one.model_copy(update={"drive": stiff.drive}), 1e-3)
+        require_cascade(shipped_one.changed(drive=stiff.drive), 1e-3)
 
 
 def test_a_loop_that_is_closed_here_is_not_blamed_on_the_drives_gains() -> None:
@@ -147,7 +146,7 @@ def test_a_loop_that_is_closed_here_is_not_blamed_on_the_drives_gains() -> None:
     soft = shipped("realistic")
     known = {"velocity_gain_Nmspr": 500.0, "velocity_integral_Nmprad": 40_000.0}
     for gains in (known, dict.fromkeys(known)):
-        config = soft.model_copy(update={"drive": own_loop("csv", position_gain_ps=50.0, **gains).drive})
+        config = soft.changed(drive=own_loop("csv", position_gain_ps=50.0, **gains).drive)
         with pytest.raises(MarginError, match="position loop") as caught:
             require_cascade(config, 1e-3)
         assert caught.value.hint.startswith("a lower drive.cascade.position_gain_ps (now 50)")
@@ -299,8 +298,7 @@ def test_a_twist_correction_that_meets_the_links_resonance_is_refused(twist_radp
     )  # fmt: skip
     cascade = {"position_gain_ps": 40.0, "velocity_gain_Nmspr": 160.0, "velocity_integral_Nmprad": 8000.0}
     section = drive_of(own_loop(**cascade))
-    drive = drive_of(soft).model_copy(update={"mode": "csp", "cascade": section.cascade})
-    config = soft.model_copy(update={"drive": drive})
+    config = soft.changed(drive__mode="csp", drive__cascade=section.cascade)
     *own, twist = cascade_margins(config, 1.9e-3)
     assert all(loop.stable and loop.phase_margin_deg > 45.0 for loop in own)
     assert twist.stable is not swings

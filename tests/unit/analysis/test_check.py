@@ -346,7 +346,7 @@ def rigid_law_behind_a_reducer(encoder: str) -> Config:
     """The law of precise.toml on the joint of realistic.toml."""
     config = shipped("realistic", control=shipped("precise").control)
     assert config.joint_encoder is not None
-    return config.model_copy(update={"joint_encoder": config.joint_encoder.model_copy(update={"law": encoder})})
+    return config.changed(joint_encoder__law=encoder)
 
 
 def test_the_worst_of_all_joints_is_judged_and_named(tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ def test_a_law_for_a_rigid_joint_is_refused_on_the_link_of_a_soft_reducer() -> N
     # its twin: a softer law of that kind on the motor's encoder
     motor = rigid_law_behind_a_reducer("encoder")
     soft = {"kp": 300.0, "kv": 20.0, "observer_radps": 40.0, "velocity_cutoff_Hz": 300.0, "learning": None}
-    assert run_check(motor.model_copy(update={"control": motor.control.model_copy(update=soft)}))[2] == 0
+    assert run_check(motor.changed(control=soft))[2] == 0
 
 
 def test_a_wider_payload_range_is_judged_and_no_longer_a_warning() -> None:
@@ -383,7 +383,7 @@ def test_friction_that_holds_is_looked_at_where_its_bristles_are_known() -> None
     assert config.friction is not None
     names = [joint.name for joint in loop_settings(config)[0].joints]
     assert sum("held by friction" in name for name in names) == 9
-    without = config.model_copy(update={"friction": config.friction.model_copy(update={"lugre": None})})
+    without = config.changed(friction__lugre=None)
     assert not any("held" in joint.name for joint in loop_settings(without)[0].joints)
 
 

@@ -402,7 +402,7 @@ def test_the_shipped_gains_are_carried_by_the_rate(config: Config, delay_s: floa
 
 def test_gains_of_a_fast_bus_are_refused_naming_some_that_are_carried(config: Config) -> None:
     control = config.control.model_copy(update={"kp": 784.0, "kv": 56.0, "lyapunov_q": (1800.0,)})
-    fast = config.model_copy(update={"control": control})
+    fast = config.changed(control=control)
     with pytest.raises(MarginError) as caught:
         require_margin(fast, 0.003)
     found = re.search(r"a slower loop: control.kp = ([\d.]+), kv = ([\d.]+), lyapunov_q = ([\d.]+)", caught.value.hint)
@@ -410,8 +410,8 @@ def test_gains_of_a_fast_bus_are_refused_naming_some_that_are_carried(config: Co
     kp, kv, q = map(float, found.groups())
     named = control.model_copy(update={"kp": kp, "kv": kv, "lyapunov_q": (q,)})
     # the printed gains are rounded to four digits, which may cost some hundredths of a degree
-    margin = config.margin.model_copy(update={"min_phase_margin_deg": config.margin.min_phase_margin_deg - 0.2})
-    assert require_margin(config.model_copy(update={"control": named, "margin": margin}), 0.003).stable
+    least_deg = config.margin.min_phase_margin_deg - 0.2
+    assert require_margin(config.changed(control=named, margin__min_phase_margin_deg=least_deg), 0.003).stable
 
 
 @pytest.mark.parametrize("fault", SERIAL_TEXTS)

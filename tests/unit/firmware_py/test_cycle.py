@@ -476,9 +476,7 @@ class MemoryBus:
 def test_the_portable_loop_and_lockstep_do_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled and in plain Python, frames moved in memory and over a python-can bus: one and the same cycle."""
     config = load_config(shipped_config("virtual"))
-    joint = LockstepJoint(
-        config.model_copy(update={"trajectory": config.trajectory.model_copy(update={"duration_s": 0.5})})
-    )
+    joint = LockstepJoint(config.changed(trajectory__duration_s=0.5))
     expected = joint.run().log
     bus, block = MemoryBus(joint), SharedBlock.create(len(joint.table), CanopenPort)
     try:

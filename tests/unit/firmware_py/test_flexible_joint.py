@@ -273,7 +273,7 @@ def test_what_maps_and_the_second_encoder_buy() -> None:
     assert whole.joint_encoder is not None
     without_maps = realistic(reducer__map=None)
     motor = {"joint_encoder": whole.joint_encoder.model_copy(update={"law": "encoder"})}
-    rigid = shipped("precise").control.model_copy(update={"learning": None})
+    rigid = shipped("precise", control__learning=None).control
     found = [
         rmse(link_error_mrad(config, 5.0))
         for config in (whole, realistic(**motor), without_maps, realistic(**motor, control=rigid))
@@ -324,10 +324,8 @@ def test_a_load_on_the_link_is_held_where_the_link_is_and_the_rigid_law_on_the_m
     whole = realistic(virtual__load_step_Nm=3.0, virtual__load_step_at_s=6.0)
     error = link_error_mrad(whole, 8.0)
     assert rmse(error) < 0.06
-    motor = whole.joint_encoder
-    assert motor is not None
-    rigid = shipped("precise").control.model_copy(update={"learning": None})
-    other = whole.model_copy(update={"joint_encoder": motor.model_copy(update={"law": "encoder"}), "control": rigid})
+    rigid = shipped("precise", control__learning=None).control
+    other = whole.changed(joint_encoder__law="encoder", control=rigid)
     assert abs(np.mean(link_error_mrad(other, 8.0))) > 0.12  # 3 Nm on 1.6e4 Nm/rad and more
 
 

@@ -90,16 +90,14 @@ def test_one_of_seven_joints_that_trips_stops_all_in_the_same_cycle(seven: Locks
 def on_two_buses(arm: ArmConfig) -> ArmConfig:
     """The wrist alone on a second one, with the shoulder's node."""
     *others, wrist = arm.joints
-    bus = wrist.bus.model_copy(update={"channel": "virtual1"})
-    drive = wrist.drive.model_copy(update={"node": 1})
-    return replace(arm, joints=(*others, wrist.model_copy(update={"bus": bus, "drive": drive})))
+    return replace(arm, joints=(*others, wrist.changed(bus__channel="virtual1", drive__node=1)))
 
 
 @pytest.mark.parametrize("brake", [True, False])
 def test_a_joint_without_a_brake_falls_while_its_power_is_off(arm: LockstepArm, brake: bool) -> None:
     """Before the start, where all drives are off: gravity is more than its friction."""
     first = arm.arm.joints[0]
-    changed = first.model_copy(update={"virtual": first.virtual.model_copy(update={"brake": brake})})
+    changed = first.changed(virtual__brake=brake)
     given = replace(arm.arm, joints=(changed, *arm.arm.joints[1:]))
     position = arm.run(plant=arm_plant_of(given), longest_s=0.045)[0].truth[:, TRUE_POSITION_rad]
     assert (abs(position[-1] - position[0]) < 1e-3) == brake

@@ -201,11 +201,8 @@ def test_a_move_beyond_a_limit_names_the_joint_and_moves_none(
 def upright(torque_max_Nm: float) -> ArmConfig:
     """The shipped arm, its upper arm nearly upright, with another torque limit of the shoulder."""
     arm = load_arm(SHIPPED_ARM)
-    first, virtual = arm.joints[0], arm.joints[0].virtual
-    assert virtual is not None
-    limits = first.limits.model_copy(update={"torque_max_Nm": torque_max_Nm})
-    virtual = virtual.model_copy(update={"initial_position_rad": 1.3})
-    return replace(arm, joints=(first.model_copy(update={"limits": limits, "virtual": virtual}), *arm.joints[1:]))
+    first = arm.joints[0].changed(limits__torque_max_Nm=torque_max_Nm, virtual__initial_position_rad=1.3)
+    return replace(arm, joints=(first, *arm.joints[1:]))
 
 
 @pytest.mark.parametrize(("limit_Nm", "allowed"), [(28.0, False), (70.0, True)])

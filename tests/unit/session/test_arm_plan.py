@@ -246,7 +246,7 @@ def test_a_program_moves_each_joint_viewers_none() -> None:
 
 def test_of_an_arm_the_newest_logs_of_each_joint_are_kept(arm: ArmConfig, tmp_path: Path) -> None:
     config = arm.joints[0]
-    config = config.model_copy(update={"log": config.log.model_copy(update={"keep": 2})})
+    config = config.changed(log__keep=2)
     for minute in range(3):
         for name in NAMES:
             for ending in ("mcap", "png"):
@@ -306,7 +306,7 @@ def test_an_approach_that_ends_at_a_limit_is_allowed_from_everywhere(limit_rad: 
     config = changed(
         load_config(shipped_config("virtual")), limits__position_min_rad=-0.7, limits__position_max_rad=0.7
     )
-    plan = resolve(config.model_copy(update={"trajectory": hold}))
+    plan = resolve(config.changed(trajectory=hold))
     for start_rad in np.linspace(-0.7, 0.7, 60):
         plan.placed([report(float(start_rad))])
 

@@ -82,9 +82,7 @@ def settings_of(settings: CanopenSettings, node: int) -> CanopenSettings:
 def arm(settings_of_virtual_joint: CanopenSettings) -> Iterator[Arm]:
     config = load_config(CONFIGS / "virtual.toml")
     settings_of_virtual_joint = dataclasses.replace(settings_of_virtual_joint, sdo_timeout_s=1.0)
-    configs = [
-        config.model_copy(update={"drive": config.drive.model_copy(update={"node": node})}) for node in NODES
-    ]  # fmt: skip
+    configs = [config.changed(drive__node=node) for node in NODES]
     drives = Drives(new_devices(configs))
     with DeviceOnBus(drives, settings_of_virtual_joint) as bus:  # type: ignore[arg-type]
         first = bus.drive(settings_of_virtual_joint)
