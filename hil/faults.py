@@ -97,7 +97,6 @@ class FaultMemory:
     late_due_ns: Annotated[np.ndarray, array_of(i8, LATE_FRAMES)]  # 0 = after the next frame of this direction
     late_to_drive: Annotated[np.ndarray, array_of(i4, LATE_FRAMES)]
     late_frames: Annotated[np.ndarray, array_of(u1, LATE_FRAMES, FRAME_SIZE)]
-    affected: i8  # frames that were lost, late, doubled or changed
     ready: FrameQueue
     to_controller: FrameQueue  # lockstep: the controller's mailbox
 
@@ -424,8 +423,6 @@ def pass_frame(
                 overtaken = True
             else:
                 corrupted = True
-    if lost or twice or overtaken or corrupted or length >= 0 or late_ns > 0:
-        memory.affected += 1
     if lost:
         return
     if late_ns > 0:

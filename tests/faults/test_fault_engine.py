@@ -77,7 +77,6 @@ def test_what_is_lost_and_what_is_not(kind: FaultKind) -> None:
     for to_drive, frames in ((True, TO_DRIVE), (False, TO_CONTROLLER)):
         for frame in frames:
             assert len(wire.send(frame, to_drive)) == (0 if frame in LOST[kind] else 1), frame
-    assert wire.memory[0].affected == len(LOST[kind])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])

@@ -98,13 +98,6 @@ def test_gravity_has_no_lever_at_its_zero():
         assert s[0].gravity_torque_Nm == pytest.approx(10.0)
 
 
-def test_gravity_sign_pulls_towards_zero():
-    c, s = plant(gravity_Nm=10.0, initial_position_rad=math.pi / 2.0)
-    run(c[0], s[0], 0.0, 1)
-    assert s[0].gravity_torque_Nm == pytest.approx(10.0)
-    assert s[0].joint_velocity_radps < 0.0
-
-
 def assert_rings(c, s, torque_Nm, about_rad, stiffness_Nmprad):
     """Undamped, at the free-free frequency of this stiffness; `about_rad`: twist that the torque holds."""
     twist = np.empty(20000)
