@@ -166,11 +166,18 @@ def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.fixture
-def jointctl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
-    """`jointctl WORDS` in the process of the test: for what ends before it starts another one."""
+def main_in_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`main` leaves the streams and the end of the test's process alone."""
     for name in ("occupy_standard_streams", "never_refuse_a_character", "_start_quickly"):
         monkeypatch.setattr(main_module, name, lambda: None)
     monkeypatch.setattr(main_module.atexit, "register", lambda *_: None)
+
+
+@pytest.fixture
+def jointctl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], main_in_test: None
+) -> Callable[..., Finished]:
+    """`jointctl WORDS` in the process of the test: for what ends before it starts another one."""
 
     def run(*words: str) -> Finished:
         monkeypatch.setattr(sys, "argv", ["jointctl", *words])

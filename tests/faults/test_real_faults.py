@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,17 +159,6 @@ class AtTracking(Display):
 
     def __init__(self, do: Callable[[], None]) -> None:
         self._do: Callable[[], None] | None = do
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def note(self, text: str) -> None:
-        pass
-
-    phase = note
 
     def show(self, snapshot: Snapshot) -> None:
         if self._do is not None and snapshot.record.trajectory_s > AT_s:

@@ -34,6 +34,14 @@ def processes_in(folder: Path) -> list[int]:
     return found
 
 
+def client(channel: str) -> canopen.Network:
+    """An independent CANopen client on a virtual bus."""
+    network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.02
+    network.connect(interface="jointctl", channel=channel)
+    return network
+
+
 class Bench:
     """A folder, a bus of its own name, and `jointctl` as a user types it there."""
 
@@ -97,11 +105,7 @@ class Bench:
         return self.start("hil", config).saw("Ctrl-C ends it")
 
     def network(self) -> Any:
-        """An independent CANopen client on the bus."""
-        network = canopen.Network()
-        network.NOTIFIER_CYCLE = 0.02
-        network.connect(interface="jointctl", channel=self.channel)
-        return network
+        return client(self.channel)
 
     def status_word(self, node: int = 1) -> int:
         """6041 as an independent client reads it; NMT first, since a stopped node answers no SDO.

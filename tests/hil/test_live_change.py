@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.session.display import Display, Snapshot, ViewerRequest
+from jointctl.tools.session.display import Display, ViewerRequest
 from jointctl.tools.session.result import RunResult
 from tests.sessions import session_of
 
@@ -33,14 +33,6 @@ class Script(Display):
         self._settled = 0
         self._answers = 0
         self._give_up_s = time.monotonic() + 40.0
-
-    def note(self, text: str) -> None:
-        pass
-
-    phase = note
-
-    def show(self, snapshot: Snapshot) -> None:
-        pass
 
     def event(self, event: Event) -> None:
         self.events.append(event.text)
@@ -60,12 +52,6 @@ class Script(Display):
     def stop_request(self) -> StopRequest:
         done = not self._left and self._settled >= 3
         return StopRequest.RAMP if done or time.monotonic() > self._give_up_s else StopRequest.NONE
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 def carried_out(bench: Any, *requests: tuple[str, dict[str, Any]], **changes: Any) -> tuple[Script, RunResult]:

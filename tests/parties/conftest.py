@@ -14,6 +14,7 @@ from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
 from jointctl.hil.plant import plant
 from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusHub
+from tests.hil.bench import client
 from tests.hil.conftest import bench as bench
 from tests.places import EDS
 
@@ -30,10 +31,7 @@ class Joint:
     node_id: int = NODE
 
     def network(self) -> canopen.Network:
-        network = canopen.Network()
-        network.NOTIFIER_CYCLE = 0.02
-        network.connect(interface="jointctl", channel=self.channel)
-        return network
+        return client(self.channel)
 
     @property
     def status(self) -> int:

@@ -25,13 +25,14 @@ from jointctl.tools.analysis.linear_loop import (
     linear_loop,
     network_gains,
 )
+from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
 from jointctl.tools.configuration.config import Learning
 
 # --- zeros and minima by a grid that shrinks round by round: every start of a motion would wait for scipy.optimize ---
 
 _ROUND_POINTS = 33  # of a round; an odd number keeps a symmetric extremum on the grid
 
-OBSERVING = (ControllerKind.COMPUTED_TORQUE_OBSERVER, ControllerKind.FLEXIBLE_JOINT)
+OBSERVING = tuple(ControllerKind[kind.upper()] for kind in OBSERVING_LAWS)
 
 Function = Callable[[np.ndarray], np.ndarray]
 

@@ -82,6 +82,7 @@ def test_a_stop_is_tried_all_the_same(tmp_path: Path) -> None:
         (PermissionError(13, "Permission denied"), "Permission denied"),
     ],
 )
+@pytest.mark.usefixtures("main_in_test")
 def test_an_unexpected_error_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, words: str
 ) -> None:
@@ -89,9 +90,6 @@ def test_an_unexpected_error_is_one_line(
         raise error
 
     monkeypatch.setattr(main_module, "app", fail)
-    for name in ("occupy_standard_streams", "never_refuse_a_character", "_start_quickly"):
-        monkeypatch.setattr(main_module, name, lambda: None)
-    monkeypatch.setattr(main_module.atexit, "register", lambda *_: None)
     monkeypatch.delenv(TRACEBACK)
     with pytest.raises(SystemExit) as raised:
         main_module.main()
@@ -244,6 +242,7 @@ def test_its_twin_another_verb_is_ended_by_a_signal_as_any_program(number: signa
     assert ended_while_importing(number, "check")[0] == code
 
 
+@pytest.mark.usefixtures("main_in_test")
 @pytest.mark.parametrize("by", ["", " by jointctl stop"])
 @pytest.mark.parametrize("where", ["check", "_loaded_joint_or_arm"])
 def test_an_interruption_that_leaves_a_verb_is_one_line(
@@ -259,9 +258,6 @@ def test_an_interruption_that_leaves_a_verb_is_one_line(
     )
     monkeypatch.setattr(target, interrupted)
     monkeypatch.setattr(sys, "argv", ["jointctl", "check", "virtual"])
-    for name in ("occupy_standard_streams", "never_refuse_a_character", "_start_quickly"):
-        monkeypatch.setattr(main_module, name, lambda: None)
-    monkeypatch.setattr(main_module.atexit, "register", lambda *_: None)
     with pytest.raises(SystemExit) as raised:
         main_module.main()
     assert raised.value.code == INTERRUPTED
