@@ -170,35 +170,20 @@ def warm_up_compiled_loop() -> None:
     os.close(block.fd)
 
 
-# --- The loop on a serial line ---
-#
-# It is compiled, and not plain Python as for CAN adapters without a descriptor: a serial port is a descriptor that the
-# C library reads and writes.  Wake-up late p50 / p99 / max at 150 Hz on a noisy 2-core virtual machine, SCHED_FIFO:
-# this loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168 us without SCHED_FIFO.
-
-
 @contextmanager
 def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
-    """The compiled loop on a serial line, warm.
+    """The compiled loop on a serial line, warm; a port is a descriptor that the C library reads and writes.
 
-    The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
-    loop ends, the drive is commanded to switch off: it would keep its last torque command for ever.
+    It is opened when the loop is let go: by then the supervisor has locked and configured it.
     """
     from jointctl.drivers.elmo import exchange
-    from jointctl.drivers.elmo.dialogue import SWITCH_OFF, open_descriptor
 
     call = loop_call(exchange, exchange.link_of(block.port), block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
 
     def go() -> None:
-        fd = open_descriptor(order.channel)
-        try:
-            block.port[0].fd = fd
+        with exchange.attached(block.port, order.channel):
             call(FOREVER)
-        finally:
-            with contextlib.suppress(OSError):
-                os.write(fd, SWITCH_OFF)
-            os.close(fd)
 
     yield ReadyLoop(go)
 
