@@ -191,7 +191,6 @@ class DeviceOnBus:
         drive = CanopenDrive(bus, settings, sleep=sleep, gate=gate)
         if listened:
             drive._others._started_s -= LISTEN_S
-        assert drive._network.notifier is not None
         drive._network.notifier.add_listener(hear)
         self._drives.append((drive, passed))
         return drive
@@ -208,11 +207,9 @@ class DeviceOnBus:
 
     def value(self, index: int, sub: int = 0) -> int:
         """What the drive's dictionary holds."""
-        assert self.device is not None
         return int(self.device.objects.value(index, sub))
 
     def store(self, index: int, sub: int, number: int) -> None:
         """A default of the drive that is not the virtual one's."""
-        assert self.device is not None
         size = self.device.objects.entry(index, sub).size
         self.device.objects.store(index, sub, struct.pack("<q", number)[:size])

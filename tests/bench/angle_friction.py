@@ -63,7 +63,6 @@ def base_config() -> Config:
 def identified(config: Config, design: Design) -> MotionFit:
     """What `identify` makes of the log of `excite`."""
     with TemporaryDirectory() as name:
-        assert config.virtual is not None
         log = excited(config, design, config.virtual.ambient_degC, Path(name))
         settings = MotionSettings(speed_min_radps=0.8 * design.slowest_radps)
         return identify_motion(motion_from(log, ForeignFormat(), settings), settings)
@@ -71,7 +70,6 @@ def identified(config: Config, design: Design) -> MotionFit:
 
 def believing(config: Config, friction: Friction, ripple: Ripple | None = None) -> Config:
     """With another section, whose bristles are those of the file, and the ripple that was found."""
-    assert config.friction is not None
     return config.changed(friction=friction, ripple=ripple, friction__lugre=config.friction.lugre)
 
 
@@ -89,7 +87,6 @@ def random_joint(seed: int, index: int, design: Design) -> tuple[np.ndarray, str
     random = np.random.default_rng([seed, index, 2])
     config = random_plant(base_config(), EnsembleSettings(friction_scale=(0.98, 1.02)), seed, index)
     assert config.virtual is not None
-    assert config.friction is not None
     angle = true_angle(config.joint.reduction_ratio, random)
     truth = config.friction.model_copy(update={"angle": angle})
     config = config.changed(virtual__friction=truth)

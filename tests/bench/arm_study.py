@@ -65,8 +65,6 @@ def random_arm(
     """
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
-        assert config.friction is not None
-        assert config.friction.lugre is not None
         size = config.friction.lugre.stiffness_Nmprad / PAPER_BRISTLE_Nmprad  # of its friction beside the paper's joint
         low, high = EnsembleSettings().bristle_stiffness_Nmprad
         ensemble = EnsembleSettings(

@@ -91,7 +91,6 @@ def _onlooker(kind: str, port: int, client_cpu: int | None, costs: list[list[np.
             costs.append([(_used(pid) - used) / seconds for pid, used in zip(pids, before, strict=True)])
 
         try:
-            assert process.stdout is not None
             assert process.stdout.readline()  # it has seen a message
             _signal(pids, signal.SIGSTOP)
             yield look_on

@@ -75,7 +75,6 @@ def base_config() -> Config:
 
 def true_terms(config: Config, random: np.random.Generator, **virtual: Any) -> tuple[Config, Friction]:
     """The joint with friction that goes with load and temperature, which the controller knows nothing of; the truth."""
-    assert config.friction is not None
     truth = config.friction.model_copy(update={
         "load": FrictionLoad(coulomb=random.uniform(0.03, 0.2), viscous_spr=random.uniform(0.0, 0.1)),
         "temperature": FrictionTemperature(

@@ -125,7 +125,6 @@ def soak(minutes: float, folder: Path, every_s: float) -> dict[str, Any]:
                     one.look(now_s)
                 loads.append(os.getloadavg()[0])
             time.sleep(every_s)
-        assert run.stdout is not None
         result = json.loads(run.stdout.read())
     log = read_run_log(result["log"])
     late_us = np.asarray(log.records["wake_late_ns"]) / 1e3

@@ -80,7 +80,6 @@ def until_enabled_s(config_path: Path, channel: str, cache: Path | None = None) 
 
 def _wait_for(process: subprocess.Popen[bytes], words: tuple[str, ...], begin_s: float) -> float:
     """Seconds since `begin_s` when a line of stderr is one of `words`."""
-    assert process.stderr is not None
     fd, text = process.stderr.fileno(), ""
     while (left_s := begin_s + LONGEST_S - time.perf_counter()) > 0.0:
         ready, _, _ = select.select([fd], [], [], left_s)

@@ -123,7 +123,6 @@ def wrong_guess(config: Config, seed: int, index: int) -> Config:
     """What a user begins with; the virtual joint stays what it is."""
     random = np.random.default_rng([seed, index, 1])
     inertia, friction = (float(math.exp(random.uniform(-math.log(2.0), math.log(2.0)))) for _ in range(2))
-    assert config.virtual is not None
     assert config.friction is not None
     return config.changed(
         joint__inertia_kgm2=inertia * config.joint.inertia_kgm2,
@@ -259,7 +258,6 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
         plant = unloaded(plant, seed, index)
     if encoders == "motor":
         plant = plant.changed(joint_encoder=None)
-    assert plant.virtual is not None
     true_kgm2 = plant.joint.inertia_kgm2 * plant.virtual.inertia_scale
     guess = wrong_guess(plant, seed, index)
     silent = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())

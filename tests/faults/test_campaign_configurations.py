@@ -260,7 +260,6 @@ def test_a_drift_beside_another_encoder_is_harmless_within_what_they_may_differ_
     twin = dataclasses.replace(draw_scenario(880611, 53, "tune"), duration_s=0.97, magnitude=-0.007)
     assert (twin.kind, twin.harmless) == (FaultKind.ENCODER_DRIFT, True)
     both = load_config(CONFIGS / "realistic.toml")
-    assert both.joint_encoder is not None
     assert fitted(both, twin).duration_s == pytest.approx(0.5 * both.joint_encoder.disagreement_max_rad / 0.007)
     for config, other in ((shipped(), twin), (both, dataclasses.replace(twin, harmless=False))):
         assert fitted(config, other) == other

@@ -25,7 +25,6 @@ def own_loop(mode: str, **cascade: Any) -> Config:
     config = changed(shipped("csp"), trajectory__duration_s=6.0)
     drive = config.drive
     assert isinstance(drive, CanopenSection)
-    assert drive.cascade is not None
     return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
 
 

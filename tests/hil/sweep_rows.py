@@ -17,6 +17,5 @@ def rows(out: Path) -> Any:
 
 
 def truth_Nm(config: Config, velocity_radps: np.ndarray) -> np.ndarray:
-    assert config.virtual is not None
     assert config.virtual.friction is not None
     return friction_curve_Nm(friction_constants(config.virtual.friction, 121.0), velocity_radps)

@@ -33,7 +33,6 @@ def bench() -> Config:
 
 
 def true_friction(config: Config) -> Friction:
-    assert config.virtual is not None
     assert config.virtual.friction is not None
     return config.virtual.friction
 

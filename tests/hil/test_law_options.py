@@ -155,7 +155,6 @@ _LEARNING = {
 def test_the_convergence_that_is_computed_is_the_one_that_is_seen(name: str) -> None:
     gain, error_gain, lead, half_width = _LEARNING[name]
     precise = from_file("precise")
-    assert precise.control.learning is not None
     values = {"gain": gain, "error_gain_ps2": error_gain, "lead_cycles": lead, "half_width_cycles": half_width}
     learning = {**precise.control.learning.model_dump(), **values}
     controller = replace(precise, control=changed(precise.control, {"learning": learning}, name))

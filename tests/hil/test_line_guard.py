@@ -130,7 +130,6 @@ def test_another_program_on_the_port_is_named_and_left_alone(serial_bench: Any) 
     )
     other = subprocess.Popen([sys.executable, "-c", program, serial_bench.device.path], stdout=subprocess.PIPE)
     try:
-        assert other.stdout is not None
         other.stdout.readline()
         stopped = serial_bench.bench.run("stop", "serial.toml")
         assert (stopped.code, "the drive is off" in stopped.out) == (0, True), stopped

@@ -29,7 +29,6 @@ def test_the_map_of_the_realistic_joint_is_found_and_written(tmp_path: Path) -> 
     assert map_verb(load_config(path), output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png") == 0
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     found = load_config(path)
-    assert found.reducer is not None
     assert found.reducer.map is not None
     assert found.virtual is not None
     made, true = found.reducer.map, found.virtual
@@ -68,8 +67,6 @@ def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_befor
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     assert map_verb(before, output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png") == 0
     after = load_config(path)
-    assert after.ripple is not None
-    assert after.virtual is not None
     found = dict(zip(after.ripple.per_motor_turn, after.ripple.torque_Nm, strict=True))
     assert [found[order] for order in (2.0, 10.0)] == pytest.approx(after.virtual.torque_ripple_Nm, rel=0.15)
     rms = []
@@ -94,7 +91,6 @@ def test_bristles_that_follow_a_quick_swing_late_leave_the_ripple_in_its_interva
     run = LockstepJoint(moving).run()
     assert not run.fault
     ripple = found_map(map_run(moving, run.log, 0.0015)).ripple_Nm[9]
-    assert config.virtual is not None
     assert abs(ripple.amplitude - config.virtual.torque_ripple_Nm[1]) < ripple.amplitude_half < 0.4 * ripple.amplitude
 
 

@@ -33,7 +33,6 @@ def own_loop(mode: str = "csp", **cascade: Any) -> Config:
     config = shipped("csp")
     drive = config.drive
     assert isinstance(drive, CanopenSection)
-    assert drive.cascade is not None
     return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
 
 

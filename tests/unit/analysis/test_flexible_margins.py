@@ -234,7 +234,6 @@ def with_encoders(config: Config, encoders: Encoders) -> Config:
     """The encoder on the motor alone, or that on the link alone."""
     if encoders == Encoders.BOTH:
         return config
-    assert config.joint_encoder is not None
     counts = config.joint_encoder.counts_per_turn
     alone = changed(config, joint_encoder=None)
     return alone if encoders == Encoders.MOTOR else changed(

@@ -188,7 +188,6 @@ def reader_of(joint: DeviceOnBus) -> Any:
 
 
 def test_limits_and_polarity_of_the_drive(tmp_path: Path, joint: DeviceOnBus) -> None:
-    assert joint.device is not None
     zero = joint.device.objects.value(0x6064, 0)
     joint.answers |= {(0x607D, 1): zero - 83443, (0x607D, 2): zero + 83443, (0x6080, 0): 200}
     with reader_of(joint) as network:

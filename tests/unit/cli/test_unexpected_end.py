@@ -222,7 +222,6 @@ def ended_while_importing(number: signal.Signals, *words: str) -> tuple[int, str
     """(exit code, what it said) of a verb that got this signal."""
     command = [sys.executable, "-c", STUCK, *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as started:
-        assert started.stdout is not None
         assert started.stdout.readline() == "importing\n"
         started.send_signal(number)
         try:

@@ -162,7 +162,6 @@ def test_no_process_that_was_started_keeps_the_lock(channel: str) -> None:
     lock = BusLock("socketcan", channel)
     command = [sys.executable, "-c", "print(flush=True); input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, close_fds=False) as child:
-        assert child.stdout is not None
         assert child.stdout.readline()
         lock.close()
         BusLock("socketcan", channel).close()
@@ -187,7 +186,6 @@ def controller(channel: str, code: str = HOLD) -> Iterator[subprocess.Popen[str]
     command = [sys.executable, "-c", code, "socketcan", channel]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             assert process.stdout.readline() == "mine\n"
             yield process
         finally:
@@ -227,7 +225,6 @@ def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
         with StopCall("socketcan", channel) as call:
             end_programs([call], notes.append, lambda: ended.append(True))
         assert ended
-        assert process.stdout is not None
         assert process.stdout.read() == "stopped\n"
         assert process.wait(60.0) == 0
     assert notes == [f"stopping the program that controls the bus (pid {process.pid})"]

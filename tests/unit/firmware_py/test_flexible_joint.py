@@ -270,7 +270,6 @@ def test_what_maps_and_the_second_encoder_buy() -> None:
     """The last is the law for a rigid joint on the motor's encoder."""
     whole = realistic()
     assert whole.reducer is not None
-    assert whole.joint_encoder is not None
     without_maps = realistic(reducer__map=None)
     motor = {"joint_encoder": whole.joint_encoder.model_copy(update={"law": "encoder"})}
     rigid = shipped("precise", control__learning=None).control

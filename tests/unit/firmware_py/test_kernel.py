@@ -355,7 +355,6 @@ def test_machine_code_that_is_not_as_it_was_written_is_not_loaded(tmp_path: Path
 @pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
 def test_what_the_loop_and_the_virtual_joint_run_stands_alone() -> None:
     """Nothing of it is left to be found in the compiler, which their processes do not load."""
-    assert kernel_module.cache_folder is not None
     total(np.arange(3.0))
     kept = [machine_code.read(path) for path in kernel_module.cache_folder.glob("*.entry")]
     assert kept

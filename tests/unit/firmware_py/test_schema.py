@@ -130,7 +130,6 @@ def test_the_fields_of_plain_records_are_numpys(cls: type) -> None:
     array.view(np.uint8)[:] = np.arange(array.nbytes) % 64
 
     def compare(whole: np.record) -> None:
-        assert whole.dtype.names is not None
         for name in whole.dtype.names:
             own, numpys = getattr(whole, name), plain_records.numpys_attribute(whole, name)
             assert type(own) is type(numpys)

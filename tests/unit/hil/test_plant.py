@@ -33,13 +33,6 @@ def run(c, s, torque_Nm, substeps):
 
 
 @kernel
-def record_positions(c, s, torque_Nm, positions):
-    for i in range(len(positions)):
-        step_plant(c, s, torque_Nm)
-        positions[i] = s.joint_position_rad
-
-
-@kernel
 def track_sine(c, s, substeps):
     """A proportional-derivative law at 1 kHz on 0.35 sin(0.2 pi t), enough to move the plant as the paper does."""
     torque = 0.0

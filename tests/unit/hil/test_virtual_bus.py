@@ -230,7 +230,6 @@ def test_the_socket_of_a_killed_hub_is_replaced(path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"up\n"
         with pytest.raises(VirtualBusError, match="already runs"):
             VirtualBusHub(path).start()

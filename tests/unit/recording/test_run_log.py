@@ -339,7 +339,6 @@ def test_a_killed_writer_leaves_what_was_flushed(tmp_path: Path) -> None:
         "time.sleep(60)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     assert process.stdout.readline() == "written\n"
     process.kill()
     assert process.wait() == -signal.SIGKILL

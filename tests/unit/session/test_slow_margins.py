@@ -86,7 +86,6 @@ def test_the_supervisor_does_not_wait_for_the_margins_of_seven_joints(tmp_path: 
     assert not any(loop.may_enable for loop in loops)
     slow.released.set()
     for watch in watches:
-        assert watch._margins is not None
         watch._margins.result(AT_MOST_s)
         look(watch)
     assert len(slow.begun) == 7
@@ -101,7 +100,6 @@ def test_margins_that_are_refused_end_the_run(tmp_path: Path, slow: Slow) -> Non
     watch = watch_of(tmp_path, loop, said)
     look(watch)
     slow.released.set()
-    assert watch._margins is not None
     watch._margins.exception(AT_MOST_s)
     with pytest.raises(MarginError, match="too little"):
         look(watch)

@@ -350,7 +350,6 @@ def test_no_target_and_no_offset_is_left_from_before(settings_of_virtual_joint: 
 def test_the_check_judges_the_curve_that_the_law_computes(velocity_side: str) -> None:
     """Reading a configuration must not load the compiler, so `checks` has the curve once more, in its own units."""
     config = load_config(shipped_config("paper"))
-    assert config.friction is not None
     friction = config.friction.model_copy(update={"velocity_side": velocity_side})
     ratio = config.joint.reduction_ratio
     branches = friction_constants(friction, ratio)[0]

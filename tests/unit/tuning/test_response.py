@@ -172,13 +172,10 @@ def test_the_response_is_that_of_the_joint_in_spite_of_a_leg_that_is_disturbed()
     found = response_of(config, made, log)
     frequency = found.frequency_Hz
     true = sampled_joint(T, 1.2e-3, 0.5e-3, SOFT, Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
-    assert found.motor is not None
-    assert found.link is not None
     assert found.motor.response == pytest.approx(true[:, 1, 0], rel=0.01)
     assert found.link.response == pytest.approx(true[:, 0, 0], rel=0.01)
     assert found.coherence > 0.99
     again = from_dict(found.to_dict())
-    assert again.motor is not None
     assert again.motor.response == pytest.approx(found.motor.response)
     assert grown(found, again) == pytest.approx(1.0)
 
@@ -351,7 +348,6 @@ def test_a_search_that_comes_to_a_joint_that_runs_away_turns_back() -> None:
 
 def test_a_response_without_coherence_gives_no_model() -> None:
     found = made_response(RIGID, (1e-3, 0.0))
-    assert found.motor is not None
     blind = Channel(found.motor.response, found.motor.half, np.full(len(found.frequency_Hz), 0.1))
     with pytest.raises(DataError, match=r"lines with coherence \(=0\) must be at least 12"):
         fit_joint(FrequencyResponse(found.frequency_Hz, blind, None, 12, 5.0, T), 2.0)

@@ -268,6 +268,5 @@ def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float
 
 def test_settings_of_the_driver(tmp_path: Path) -> None:
     settings = canopen_settings(short_run(tmp_path, {**DRIVE, "object": "2ABC:3"}))
-    assert settings.joint_encoder is not None
     assert (settings.joint_encoder.index, settings.joint_encoder.sub) == (0x2ABC, 3)
     assert dataclasses.replace(settings, joint_encoder=None).joint_encoder is None
