@@ -26,7 +26,7 @@ SLOW_LOOP = {  # 100 Hz: gains for that rate, and limits for a busy computer
 
 def shipped(name: str = "virtual", **changes: Any) -> Config:
     """One of `configs`, with `section__key=value` changed."""
-    return changed(load_config(CONFIGS / f"{name}.toml"), **changes)
+    return load_config(CONFIGS / f"{name}.toml").changed(**changes)
 
 
 def changed(config: Config, **changes: Any) -> Config:

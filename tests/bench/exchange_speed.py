@@ -47,7 +47,6 @@ from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.arms import long_arm
 from tests.bench.c_programs import NoCompilerError, exchange_program, link_doubles, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, measured, separate_virtual_joint, skipped
-from tests.configurations import changed
 
 # --- load: a busy thread of this very process, or a busy process ---
 
@@ -451,8 +450,8 @@ def arm_for_comparison(path: Path, channel: str) -> ArmConfig:
     """An arm with the law that the C source knows."""
     arm = on_bus(load_arm(path), GivenPlace("jointctl", channel))
     joints = tuple(
-        changed(
-            joint, control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,
+        joint.changed(
+            control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,
             loop__cpu=cores()[-1], limits__sample_age_max_s=PATIENCE_S, limits__skipped_max_s=PATIENCE_S,
         )
         for joint in arm.joints
@@ -493,14 +492,14 @@ def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: floa
     if cyclictest is None:
         yield skipped(GROUP, "against cyclictest", "not installed (package rt-tests)")
     channel = f"bench{os.getpid()}"
-    config = changed(
-        config, bus__interface="jointctl", bus__channel=channel, loop__cpu=cores()[-1],
+    config = config.changed(
+        bus__interface="jointctl", bus__channel=channel, loop__cpu=cores()[-1],
         limits__sample_age_max_s=PATIENCE_S, limits__skipped_max_s=PATIENCE_S,
     )  # fmt: skip
     with separate_virtual_joint(config.path, channel):
         for rate_Hz in RATES_Hz[:1] if quick else RATES_Hz:
             for name in LOADS[:2] if quick else LOADS:
-                case = Case(changed(config, loop__rate_Hz=rate_Hz), name, seconds)
+                case = Case(config.changed(loop__rate_Hz=rate_Hz), name, seconds)
                 if program is not None:
                     yield from _against_c(case, program, rounds.in_c)
                 if cyclictest is not None:

@@ -15,7 +15,7 @@ from jointctl.tools.configuration.sections import Hold
 from jointctl.tools.experiments.controllers import controller_constants, named
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 LIMIT_Nm = 60.0
 NEAR_LIMIT_Nm = 57.0  # a torque that reaches it on both sides swings between its limits
@@ -40,7 +40,7 @@ def carry_out(
         "precise", trajectory__duration_s=duration_s, encoder__counts_per_turn=2**bits, encoder__side=side, **there
     )
     if at_rest:
-        config = changed(config, trajectory=Hold(kind="hold", duration_s=duration_s, position_rad=0.2))
+        config = config.changed(trajectory=Hold(kind="hold", duration_s=duration_s, position_rad=0.2))
     joint = LockstepJoint(config)
     chosen = named((controller,))[0]
     constants = controller_constants(

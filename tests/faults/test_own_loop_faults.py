@@ -15,14 +15,14 @@ from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELO
 from jointctl.tools.configuration.canopen import CanopenSection
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 DEAD_AT_s = 3.0
 
 
 def own_loop(mode: str, **cascade: Any) -> Config:
-    config = changed(shipped("csp"), trajectory__duration_s=6.0)
+    config = shipped("csp", trajectory__duration_s=6.0)
     drive = config.drive
     assert isinstance(drive, CanopenSection)
     return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))

@@ -20,7 +20,6 @@ from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
-from tests.configurations import changed
 from tests.sessions import output
 
 POINTS = 60
@@ -82,9 +81,9 @@ def test_the_identified_curve_is_within_two_percent(bench: Config, identified: F
 
 
 def test_a_noisy_joint_is_identified_as_well(bench: Config, tmp_path: Path) -> None:
-    rough = changed(bench, virtual__torque_ripple_Nm=(1.5, 0.5), virtual__friction_ripple=0.08)
+    rough = bench.changed(virtual__torque_ripple_Nm=(1.5, 0.5), virtual__friction_ripple=0.08)
     # one count a period of this encoder is 0.05 rad/s: less than that cannot be told from standing
-    data = data_of(changed(rough, encoder__counts_per_turn=2**17, limits__standstill_radps=0.1), tmp_path)
+    data = data_of(rough.changed(encoder__counts_per_turn=2**17, limits__standstill_radps=0.1), tmp_path)
     assert len(data.direction(1)) + len(data.direction(-1)) >= 0.9 * POINTS
     assert worst_error(model_of(data), true_friction(bench)) < 0.02
 
@@ -96,7 +95,7 @@ KNEE_DEGPS = 70.0
 def late(bench: Config, tmp_path_factory: pytest.TempPathFactory) -> tuple[Friction, Any]:
     """A joint whose stages meet at 70 deg/s with a step, and its sweep."""
     friction = with_knee(true_friction(bench), KNEE_DEGPS, 0.02)
-    return friction, data_of(changed(bench, virtual__friction=friction), tmp_path_factory.mktemp("late"))
+    return friction, data_of(bench.changed(virtual__friction=friction), tmp_path_factory.mktemp("late"))
 
 
 def test_another_knee_is_found_by_searching(late: tuple[Friction, Any]) -> None:
@@ -125,15 +124,15 @@ def test_the_knee_of_the_paper_describes_such_a_joint_worse(late: tuple[Friction
 
 def test_a_smooth_knee_elsewhere_is_within_two_percent_when_searched(bench: Config, tmp_path: Path) -> None:
     friction = with_knee(true_friction(bench), 25.0)
-    data = data_of(changed(bench, virtual__friction=friction), tmp_path)
+    data = data_of(bench.changed(virtual__friction=friction), tmp_path)
     assert worst_error(model_of(data, search_knee=True), friction) < 0.02
 
 
 def tracking_rmse_rad(config: Config, true: Friction, believed: Friction) -> float:
     """Of the paper's sine on R1, after the first period."""
     lugre = config.friction.lugre if config.friction is not None else None
-    joint = changed(
-        config, friction=believed.model_copy(update={"lugre": lugre}), trajectory__duration_s=30.0,
+    joint = config.changed(
+        friction=believed, friction__lugre=lugre, trajectory__duration_s=30.0,
         virtual__friction=true, virtual__friction_positive_scale=1.0, virtual__friction_negative_scale=1.0,
     )  # fmt: skip
     run = LockstepJoint(joint).run()

@@ -24,14 +24,13 @@ from jointctl.tools.experiments.controllers import (
 from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from tests.configurations import changed as changed_config
 from tests.configurations import shipped
 
 
 def joint(config: Config, duration_s: float, **virtual: Any) -> Config:
     """The joint with other true values, and a trajectory of this length."""
     true = {f"virtual__{key}": value for key, value in virtual.items()}
-    return changed_config(config, trajectory__duration_s=duration_s, **true)
+    return config.changed(trajectory__duration_s=duration_s, **true)
 
 
 def run(config: Config, controller: Controller, scenario: Scenario = "sine") -> LockstepRun:
@@ -61,7 +60,7 @@ def test_feed_forward_on_the_desired_velocity_removes_the_spikes_of_stick_slip()
 def test_the_zero_speed_rule_decides_what_pushes_a_joint_at_rest(rule: str, torque_Nm: float) -> None:
     config = joint(ideal("stick_slip", 0.9, 0.9), 2.0)  # the model overestimates the friction
     controller = law(rule, zero_rule=rule, zero_band_radps=0.01)
-    at_rest = tracked(run(changed_config(config, trajectory__amplitude_rad=0.0), controller))
+    at_rest = tracked(run(config.changed(trajectory__amplitude_rad=0.0), controller))
     assert at_rest.friction_torque_Nm[0] == pytest.approx(torque_Nm)
     moved_rad = float(np.max(np.abs(at_rest.position_rad)))
     assert (moved_rad > 1e-5) == (rule == "paper")
@@ -177,7 +176,7 @@ def test_the_convergence_that_is_computed_is_the_one_that_is_seen(name: str) -> 
 @pytest.mark.parametrize(("side", "counts", "stable"), [("joint", 2**19, False), ("motor", 2**14, True)])
 def test_with_a_soft_reducer_the_encoder_belongs_on_the_motor(side: str, counts: int, stable: bool) -> None:
     config = joint(r1(), 6.0, flexible=True, reducer_stiffness_Nmprad=1.3e4)
-    config = changed_config(config, encoder__side=side, encoder__counts_per_turn=counts)
+    config = config.changed(encoder__side=side, encoder__counts_per_turn=counts)
     made = run_scenario(LockstepJoint(config), controller_constants(config, from_file("precise"), 0.0))
     assert (made.fault is Fault.NONE) == stable
     if stable:

@@ -40,7 +40,6 @@ from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.paper import paper
-from tests.configurations import changed
 from tests.page_figures import foreign_colours, svgs
 from tests.places import ROOT
 
@@ -258,7 +257,7 @@ def test_the_measured_error_is_the_true_one_within_the_encoders_step() -> None:
 
 def test_a_change_after_the_end_of_the_trajectory_is_refused() -> None:
     plant: Any = ideal("none")
-    short = changed(plant, trajectory__duration_s=80.0)
+    short = plant.changed(trajectory__duration_s=80.0)
     with pytest.raises(ConfigurationError, match=r"duration_s \(=80\) must be more than 80"):
         Experiment("late", short, law("late"), "load").run()
     assert LockstepJoint(short).report.start_position_rad == pytest.approx(0.0, abs=1e-5)

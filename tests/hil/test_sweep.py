@@ -16,7 +16,6 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.sweeping.options import SweepOptions, SweepPoint
 from jointctl.tools.verbs.sweep import Sweep, sweep
-from tests.configurations import changed
 from tests.hil.sweep_rows import rows, truth_Nm
 from tests.sessions import output
 
@@ -60,7 +59,7 @@ def test_the_swept_curve_is_the_sliding_curve_of_the_joint(
 def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, tmp_path: Path) -> None:
     # too little damping for the negative slope of Stribeck friction: the joint sticks and slips
     weak = {"control__kp": 400.0, "control__kv": 12.0, "control__observer_radps": 3.0}
-    joint = changed(config, virtual__friction_kind="stick_slip", **weak)
+    joint = config.changed(virtual__friction_kind="stick_slip", **weak)
     options = {"points": 4, "min_speed_radps": 0.008, "max_speed_radps": 0.016, "mode": "torque"}
     shown, _, err = output()
     assert sweep(joint, shown, tmp_path / "data.csv", SweepOptions(lockstep=True, **options)) == 0
@@ -83,7 +82,7 @@ def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
 
 
 def test_a_fault_before_the_first_point_leaves_no_file_and_says_so(config: Config, tmp_path: Path) -> None:
-    weak = changed(config, limits__torque_max_Nm=33.0)
+    weak = config.changed(limits__torque_max_Nm=33.0)
     with pytest.raises(MotionFault, match="nothing was measured") as error:
         swept(weak, tmp_path / "data.csv", points=12)
     assert "--resume" not in str(error.value)
@@ -114,7 +113,7 @@ def test_a_mode_that_the_drive_lacks_is_a_device_error(
 def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config, tmp_path: Path) -> None:
     # the first speeds need less torque than the limit, the fastest more: the drive saturates
     # (the warm-up at half the fastest speed needs 35 Nm, without a ripple that would lift it off the limit)
-    weak = changed(config, limits__torque_max_Nm=36.0)
+    weak = config.changed(limits__torque_max_Nm=36.0)
     out = tmp_path / "data.csv"
     with pytest.raises(MotionFault, match=r"points are in"):
         swept(weak, out, points=12)

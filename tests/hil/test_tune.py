@@ -43,7 +43,7 @@ from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import changed, written
+from tests.configurations import written
 from tests.page_figures import foreign_colours, svgs
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -135,7 +135,7 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(tuned: Tuned) -> None:
     assert after.margin.loop_delay_s + after.margin.current_lag_s == pytest.approx(1.5e-3, abs=0.1e-3)
     assert after.friction.positive.tc_Nm == pytest.approx(1.1 * 0.11985, rel=0.03)
     assert plant_settings(after)["inertia_kgm2"] == pytest.approx(plant_settings(before)["inertia_kgm2"], rel=1e-4)
-    true = changed(after, joint__inertia_kgm2=2.1, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
+    true = after.changed(joint__inertia_kgm2=2.1, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
     assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
     found = tuned.printed["verification"]
     assert found["after"]["rmse_mrad"] < 0.5 * found["before"]["rmse_mrad"]
@@ -164,7 +164,7 @@ def test_a_tune_of_a_light_joint_with_much_friction_takes_a_stiffer_law_for_its_
     assert found["response"]["law"] == law
     assert tuned.joint.inertia_kgm2 == pytest.approx(inertia_kgm2, rel=off)
     assert found["verification"]["after"]["rmse_mrad"] < rmse_mrad
-    true = changed(tuned, joint__inertia_kgm2=inertia_kgm2, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
+    true = tuned.changed(joint__inertia_kgm2=inertia_kgm2, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
     assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
 
 
@@ -227,7 +227,7 @@ def test_a_map_at_which_the_joint_swings_is_measured_faster(tmp_path: Path, monk
     assert speeds == [0.03, 0.06, 0.12]
     assert err.getvalue().count("swings: once more, faster") == 2
     speeds[:] = []
-    job.original = job.config = changed(job.config, limits__velocity_max_radps=0.2)
+    job.original = job.config = job.config.changed(limits__velocity_max_radps=0.2)
     with pytest.raises(LimitCycle, match="swings"):
         job._step_map()  # half of 0.2 rad/s is less than 0.12
     assert speeds == [0.03, 0.06]
@@ -505,8 +505,8 @@ def test_it_is_verified_from_wherever_the_joint_stands(
     output, *_ = outputs()
     carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
     for start_rad in (-0.69, 0.69):
-        config = changed(
-            load_config(shipped_config("precise")), trajectory__offset_rad=-0.62, trajectory__amplitude_rad=0.05,
+        config = load_config(shipped_config("precise")).changed(
+            trajectory__offset_rad=-0.62, trajectory__amplitude_rad=0.05,
             trajectory__frequency_Hz=frequency_Hz, sequence__approach_s=0.0, virtual__initial_position_rad=start_rad,
         )  # fmt: skip
         job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)

@@ -29,7 +29,7 @@ from jointctl.tools.session.plan import Motion, TerminalConsent
 from jointctl.tools.tuning.carry_out import Carried, Carrier, NotCarriedOut
 from jointctl.tools.verbs.tune import TuneOptions
 from jointctl.tools.verbs.tune_steps import Tune
-from tests.configurations import changed, shipped, written
+from tests.configurations import shipped, written
 
 OFF = ("switch on disabled", "ready to switch on", "switched on", "fault")  # states of the drive without power
 
@@ -43,7 +43,7 @@ class Watched(Carrier):
         self.motions += 1
         assert config.virtual is not None
         if self.motions >= self.since:
-            config = changed(config, virtual__inertia_scale=self.heavier * config.virtual.inertia_scale)
+            config = config.changed(virtual__inertia_scale=self.heavier * config.virtual.inertia_scale)
         return super().run(config, motion, title, also_faults=also_faults)
 
 
@@ -139,7 +139,7 @@ class FirstStages(Watched):
 def too_light(inertia_kgm2: float) -> Config:
     """2.1 kg m^2 that stick and slip, taken for less."""
     config = shipped("realistic", reducer=None, virtual__friction_kind="stick_slip")
-    return changed(config, joint__inertia_kgm2=inertia_kgm2, virtual__inertia_scale=2.1 / inertia_kgm2)
+    return config.changed(joint__inertia_kgm2=inertia_kgm2, virtual__inertia_scale=2.1 / inertia_kgm2)
 
 
 def test_an_inertia_of_less_than_half_gets_the_stiffer_law(tmp_path: Path) -> None:

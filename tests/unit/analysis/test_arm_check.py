@@ -31,7 +31,6 @@ from jointctl.tools.configuration.sections import JointEncoder, Reducer
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.new import DriveOptions, new
 from tests.arms import long_arm
-from tests.configurations import changed
 from tests.sessions import output
 
 SECOND = JointEncoder(source="drive", counts_per_turn=2**19, direction=1, zero_counts=0, disagreement_max_rad=0.02)
@@ -107,7 +106,7 @@ def test_joints_that_turn_all_round_are_looked_at_between_whole_turns(tmp_path: 
     path = long_arm(tmp_path)
     long = load_arm(path)
     turning = replace(long, joints=tuple(
-        changed(c, limits__position_min_rad=-math.tau, limits__position_max_rad=math.tau) for c in long.joints
+        c.changed(limits__position_min_rad=-math.tau, limits__position_max_rad=math.tau) for c in long.joints
     ))  # fmt: skip
     within, beyond = pose_ranges(long), pose_ranges(turning)
     for one, other in zip(within[:4], beyond[:4], strict=True):
@@ -158,7 +157,7 @@ def test_gravity_beyond_the_torque_is_refused(arm: ArmConfig) -> None:
 
 def test_check_refuses_what_the_gate_of_a_run_refuses(arm: ArmConfig) -> None:
     learning = Learning(gain=1.0, error_gain_ps2=1e5, lead_cycles=0, half_width_cycles=0)
-    joints = (*arm.joints[:2], changed(arm.joints[2], control__adaptation=None, control__learning=learning))
+    joints = (*arm.joints[:2], arm.joints[2].changed(control__adaptation=None, control__learning=learning))
     with pytest.raises(MarginError, match="wrist: iterative learning would diverge"):
         check(replace(arm, joints=joints), output()[0])
 
@@ -167,7 +166,7 @@ def test_check_says_of_an_arms_joints_what_it_says_of_a_joint_alone(arm: ArmConf
     first, *others = arm.joints
     assert first.joint.torque_constant_NmpA == 0.1
     out, shown, said = output(json=True)
-    assert check(of(arm, changed(first, joint__torque_constant_NmpA=1.0), *others), out) == 0
+    assert check(of(arm, first.changed(joint__torque_constant_NmpA=1.0), *others), out) == 0
     (warning,) = json.loads(shown.getvalue())["warnings"]
     assert "shoulder.toml: joint.torque_constant_NmpA (=1 in the drive" in warning
     assert "shoulder.toml: joint.torque_constant_NmpA" in " ".join(said.getvalue().split())
@@ -180,7 +179,7 @@ def test_check_says_of_an_arms_joints_what_it_says_of_a_joint_alone(arm: ArmConf
 def test_check_refuses_a_bus_that_no_arm_runs_on(arm: ArmConfig) -> None:
     *others, last = arm.joints
     with pytest.raises(ConfigurationError, match=r"bus.interface \(=pcan\) must be one of socketcan, jointctl"):
-        check(of(arm, *others, changed(last, bus__interface="pcan")), output()[0])
+        check(of(arm, *others, last.changed(bus__interface="pcan")), output()[0])
 
 
 def test_the_files_of_an_arm_of_ones_own(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
-from tests.configurations import changed, load, problems, shipped, written
+from tests.configurations import load, problems, shipped, written
 from tests.places import CONFIGS
 
 CSP = (CONFIGS / "csp.toml").read_text()
@@ -43,7 +43,7 @@ def drive_of(config: Config) -> CanopenSection:
 
 # --- margins ---
 def test_without_delay_and_lag_the_velocity_loop_is_the_textbook_one() -> None:
-    config = changed(own_loop(loop_rate_Hz=1e5), margin__current_lag_s=0.0)
+    config = own_loop(loop_rate_Hz=1e5).changed(margin__current_lag_s=0.0)
     velocity = cascade_margins(config, 1e-3)[0]
     inertia, gain, integral = config.joint.inertia_kgm2, 200.0, 10000.0
     omega = math.tau * velocity.crossover_Hz
@@ -61,7 +61,7 @@ def test_the_gain_margin_is_where_the_sampled_loop_becomes_unstable(loop: int, s
     config = own_loop(loop_rate_Hz=2000.0, velocity_gain_Nmspr=600.0)
     if loop:
         config = own_loop(loop_rate_Hz=2000.0, velocity_gain_Nmspr=600.0, position_gain_ps=60.0)
-    config = changed(config, margin__current_lag_s=0.5e-3)
+    config = config.changed(margin__current_lag_s=0.5e-3)
     factor = share * cascade_margins(config, 1e-3)[loop].gain_margin_up
     gains = [600.0, 10000.0, drive_of(config).cascade.position_gain_ps]  # type: ignore[union-attr]
     if loop == 0:
@@ -105,7 +105,7 @@ def _simulated(config: Config, gains: list[Any], steps: int) -> float:
 def soft_loop(side: str, mode: str = "csp", **cascade: float) -> Config:
     """The joint that realistic.toml believes, and it alone, without friction; 0.5 ms lag."""
     alone = {"margin__payload_range": (1.0, 1.0), "margin__stiffness_error": 0.0, "friction__lugre": None}
-    config = changed(shipped("realistic"), joint_encoder=None, encoder__side=side, **alone)
+    config = shipped("realistic", joint_encoder=None, encoder__side=side, **alone)
     gains = {"velocity_gain_Nmspr": 150.0, "velocity_integral_Nmprad": 5000.0, "position_gain_ps": 20.0, **cascade}
     return config.changed(drive=own_loop(mode, **gains).drive)
 
@@ -288,8 +288,8 @@ def test_a_twist_correction_that_meets_the_links_resonance_is_refused(twist_radp
     """The drive's loops alone have 50 deg and more, and the joint ended by LIMIT_CYCLE."""
     slopes = {"stiffness_Nmprad": 5e3, "knees_Nm": (2.0, 6.9), "stiffness_beyond_Nmprad": (7.5e3, 9e3)}
     truth = {f"virtual__reducer_{key}": value for key, value in slopes.items()}
-    soft = changed(
-        shipped("realistic"), **{f"reducer__{key}": value for key, value in slopes.items()}, **truth,
+    soft = shipped(
+        "realistic", **truth, reducer=slopes,
         reducer__loop_stiffness_Nmprad=7750.0, reducer__damping_Nmspr=2.1, virtual__reducer_damping_Nmspr=2.1,
         reducer__motor_inertia_kgm2=0.24, joint__inertia_kgm2=0.8, virtual__motor_side_inertia_kgm2=0.24,
         virtual__command_delay_s=0.9e-3, margin__loop_delay_s=1.9e-3, control__twist_radps=twist_radps,

@@ -27,7 +27,7 @@ from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
-from tests.configurations import changed, shipped, written
+from tests.configurations import shipped, written
 from tests.places import CONFIGS
 
 
@@ -112,7 +112,7 @@ def test_what_is_sent_to_a_drive_that_closes_its_own_loop_is_what_its_eds_has(tm
     assert "torque offset (60B2), velocity offset (60B1)" in both
     eds = tmp_path / "drive.eds"
     eds.write_text((CONFIGS / "virtual_joint.eds").read_text().replace("60B1", "60AF"))
-    without, *_ = run_check(changed(shipped("csp"), drive__eds=str(eds)))
+    without, *_ = run_check(shipped("csp", drive__eds=str(eds)))
     assert re.search(r"sent besides the target\W+torque offset \(60B2\)\W+[^│]*drive.eds has no 60B1", without)
 
 
@@ -230,7 +230,7 @@ def test_the_other_kinds_can_be_checked_and_their_remedies_name_their_own_settin
     settings: dict[str, Any], delay_s: float | None, remedy: str
 ) -> None:
     assert set(CONTROLLERS) == set(ControllerKind) - {ControllerKind.OUTSIDE}  # the torque is given: nothing to check
-    config = shipped("paper", **{f"control__{key}": value for key, value in settings.items()})
+    config = shipped("paper", control=settings)
     shown, messages, code = run_check(config, delay_s)
     assert code == (9 if remedy else 0)
     assert remedy in messages
@@ -269,7 +269,7 @@ def test_with_the_kalman_filter_the_same_encoder_is_fine_enough(bits: int, cutof
         control__velocity_cutoff_Hz=cutoff_Hz, control__kp=2500.0, control__kv=100.0, control__observer_radps=50.0,
     )  # fmt: skip
     assert not any("chatter" in text for text in not_modelled(config))
-    config = changed(config, control__velocity_cutoff_Hz=400.0, encoder__counts_per_turn=2**12)
+    config = config.changed(control__velocity_cutoff_Hz=400.0, encoder__counts_per_turn=2**12)
     assert any("chatter" in text for text in not_modelled(config))
 
 

@@ -34,7 +34,7 @@ from jointctl.tools.analysis.margins import (
     worst_case,
 )
 from jointctl.tools.configuration.config import Config
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 PERIOD_s = 1e-3
 SUBSTEP_s = 50e-6 if JIT_DISABLED else 20e-6
@@ -218,7 +218,7 @@ def test_the_link_alone_is_not_to_be_had_with_the_gains_for_both():
 def test_where_no_setting_helps_the_hint_names_gains_that_the_law_has() -> None:
     """It named q, of the network; these laws have none."""
     link = with_encoders(believed(reducer__map=None), Encoders.LINK)
-    rigid = changed(link, control__kind="computed_torque_observer", control__kp=3600.0, control__kv=120.0)
+    rigid = link.changed(control__kind="computed_torque_observer", control__kp=3600.0, control__kv=120.0)
     for config in (link, rigid):
         with pytest.raises(MarginError, match="unstable") as caught:
             require_margin(config)
@@ -235,10 +235,10 @@ def with_encoders(config: Config, encoders: Encoders) -> Config:
     if encoders == Encoders.BOTH:
         return config
     counts = config.joint_encoder.counts_per_turn
-    alone = changed(config, joint_encoder=None)
-    return alone if encoders == Encoders.MOTOR else changed(
-        alone, encoder__side="joint", encoder__counts_per_turn=counts
-    )  # fmt: skip
+    alone = config.changed(joint_encoder=None)
+    if encoders == Encoders.MOTOR:
+        return alone
+    return alone.changed(encoder__side="joint", encoder__counts_per_turn=counts)
 
 
 @cache

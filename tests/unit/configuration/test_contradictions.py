@@ -9,14 +9,14 @@ import pytest
 
 from jointctl.tools.analysis.loop_report import contradictions, trajectory_acceleration
 from jointctl.tools.configuration.conversions import law_resolution_rad, static_friction_Nm, velocity_of_a_count_radps
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 VIRTUAL = shipped()
 NO_RATED = {"drive__rated_current_A": None, "drive__rated_torque_Nm": None}
 
 
 def lines(**changes: Any) -> str:
-    return "\n".join(contradictions(changed(VIRTUAL, **changes)))
+    return "\n".join(contradictions(VIRTUAL.changed(**changes)))
 
 
 @pytest.mark.parametrize("name", ["virtual", "precise", "paper", "sweep_virtual", "elmo_serial", "realistic", "csp"])
@@ -85,14 +85,14 @@ def test_a_soft_loop_is_held_by_friction_that_is_a_little_more(share: float, war
     static_Nm = static_friction_Nm(soft)
     assert static_Nm is not None
     kp = share * 0.1 * static_Nm / (soft.joint.inertia_kgm2 * 0.01 * (1.0 + 0.1))
-    own = changed(soft, control__kp=kp, control__observer_radps=1.0)
+    own = soft.changed(control__kp=kp, control__observer_radps=1.0)
     assert any("(POSITION_FROZEN)" in line for line in contradictions(own)) is warned
-    assert contradictions(changed(own, control__feed_forward="none")) == []
+    assert contradictions(own.changed(control__feed_forward="none")) == []
 
 
 @pytest.mark.parametrize(("stiffness", "warned"), [(None, False), (1.7e4, False), (1.69e4, True)])
 def test_a_small_motion_is_no_softer(stiffness: float | None, warned: bool) -> None:
-    found = contradictions(changed(shipped("realistic"), reducer__loop_stiffness_Nmprad=stiffness))
+    found = contradictions(shipped("realistic", reducer__loop_stiffness_Nmprad=stiffness))
     assert any("hysteresis makes a small motion stiffer" in line for line in found) is warned
 
 

@@ -37,7 +37,7 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session.live_changes import new_motion
-from tests.configurations import changed, shipped, written
+from tests.configurations import shipped, written
 
 RATIO = 121.0
 JM, JL = 1.2, 0.9
@@ -348,7 +348,7 @@ def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
     monkeypatch: pytest.MonkeyPatch, believed: dict[str, Any], moves: bool
 ) -> None:
     true = realistic(trajectory__duration_s=0.5, virtual__initial_position_rad=0.1)
-    monkeypatch.setattr(lockstep, "canopen_settings", lambda _: canopen_settings(changed(true, **believed)))
+    monkeypatch.setattr(lockstep, "canopen_settings", lambda _: canopen_settings(true.changed(**believed)))
     run = LockstepJoint(true).run()
     assert (run.fault is Fault.NONE) is moves
     enabled = bool(np.any(run.log.drive_state == DriveState.ENABLED))

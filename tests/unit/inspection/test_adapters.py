@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from jointctl.tools.inspection.health import adapters_not_up, plugged_in
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 UP, DOWN = "0x40041\n", "0x40080\n"
 CONFIG = shipped()
@@ -32,7 +32,7 @@ def link(root: Path, name: str, flags: str, kind: str = "280") -> None:
 
 
 def told(root: Path, **bus: object) -> list[tuple[str, str]]:
-    config = changed(CONFIG, **{f"bus__{key}": value for key, value in bus.items()})
+    config = CONFIG.changed(bus=bus)
     return [(finding.text, finding.remedy) for finding in adapters_not_up(config, root)]
 
 

@@ -37,7 +37,6 @@ from jointctl.tools.inspection.health import (
 from jointctl.tools.verbs import doctor as doctor_module
 from jointctl.tools.verbs.doctor import doctor, findings
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
-from tests.configurations import changed
 from tests.sessions import output
 
 
@@ -97,7 +96,7 @@ class TestBus:
     def test_no_interface_is_a_problem_only_where_needed(
         self, config: Config, tmp_path: Path, interface: str, status: str
     ) -> None:
-        found = {f.topic: f for f in adapters(changed(config, bus__interface=interface), tmp_path)}["CAN interfaces"]
+        found = {f.topic: f for f in adapters(config.changed(bus__interface=interface), tmp_path)}["CAN interfaces"]
         assert (found.status, found.text) == (status, "none")
 
     @pytest.mark.parametrize(
@@ -106,13 +105,13 @@ class TestBus:
          (1000.0, 357_000, OK), (1000.0, 356_000, PROBLEM)],
     )  # fmt: skip
     def test_budget(self, config: Config, rate_Hz: float, bitrate: int, status: str) -> None:
-        found = bus_budget(changed(config, loop__rate_Hz=rate_Hz, bus__bitrate_bitps=bitrate))
+        found = bus_budget(config.changed(loop__rate_Hz=rate_Hz, bus__bitrate_bitps=bitrate))
         assert found.status == status
         assert found.numbers["load"] == pytest.approx(285.0 * rate_Hz / bitrate)
 
     @pytest.mark.parametrize(("rate_Hz", "status"), [(499.0, OK), (500.0, OK), (501.0, PROBLEM), (1000.0, PROBLEM)])
     def test_budget_of_the_plain_python_loop(self, config: Config, rate_Hz: float, status: str) -> None:
-        found = bus_budget(changed(config, bus__interface="slcan", loop__rate_Hz=rate_Hz))
+        found = bus_budget(config.changed(bus__interface="slcan", loop__rate_Hz=rate_Hz))
         assert found.status == status
         assert "plain Python loop" in found.text
 
@@ -170,13 +169,13 @@ class TestBus:
     ) -> None:
         link = {"ifname": "can0", "flags": ["UP"], "txqlen": queue, "linkinfo": {"info_kind": "can", "info_data": data}}
         monkeypatch.setattr(health, "link_state", lambda name: parse_link(link))
-        told = list(interface_state(changed(config, bus__interface="socketcan", bus__channel="can0")))
+        told = list(interface_state(config.changed(bus__interface="socketcan", bus__channel="can0")))
         assert [(finding.topic, finding.status) for finding in told] == found
         assert all(finding.remedy for finding in told if finding.status != OK)
         assert list(interface_state(config)) == []  # another kind of bus
 
     def test_a_missing_interface(self, config: Config) -> None:
-        (found,) = interface_state(changed(config, bus__interface="socketcan", bus__channel="jc_none0"))
+        (found,) = interface_state(config.changed(bus__interface="socketcan", bus__channel="jc_none0"))
         assert found.status == PROBLEM
         assert "ip link set jc_none0 up" in found.remedy
 
@@ -186,14 +185,14 @@ class TestBus:
     ) -> None:
         monkeypatch.setattr(health, "open_python_can", lambda *_: SdoBus(config.drive.node))
         monkeypatch.setattr(health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
-        found = drive_finding(changed(config, loop__rate_Hz=rate_Hz))
+        found = drive_finding(config.changed(loop__rate_Hz=rate_Hz))
         assert (found.status, found.numbers["allowed_rate_Hz"]) == (status, 600.0)
 
 
 def quick_stop(joint: Any, config: Config, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> list[Finding]:
     end = lambda *_, **__: can.Bus(interface="virtual", channel=joint.channel)  # noqa: E731
     monkeypatch.setattr("jointctl.tools.inspection.subject.open_python_can", end)
-    return list(quick_stop_finding(changed(config, **changes)))
+    return list(quick_stop_finding(config.changed(**changes)))
 
 
 class TestQuickStop:
@@ -261,7 +260,7 @@ class TestReport:
 
     def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(health, "start_time_s", lambda cache: 1.0)
-        elsewhere = changed(config, bus__channel="nobody-listens-here")
+        elsewhere = config.changed(bus__channel="nobody-listens-here")
         found = list(findings(elsewhere, wake_cycles=10))
         topics = [f.topic for f in found]
         assert len(set(topics)) == len(topics) >= 15

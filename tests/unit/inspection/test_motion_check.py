@@ -42,7 +42,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.tuning.frequency_response import motor_fed
 from jointctl.tools.verbs import doctor as doctor_motion_module
-from tests.configurations import changed, shipped, written
+from tests.configurations import shipped, written
 from tests.made_faults import one_fault
 from tests.two_encoders import NODE, config_with
 
@@ -87,7 +87,7 @@ def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tm
 def test_a_soft_joint_on_a_slow_bus_is_pulled_farther_then_with_less_torque(tmp_path: Path) -> None:
     slow = {"loop__rate_Hz": 250, "control__velocity_cutoff_Hz": 100}
     wide = motor_fed(load_config(written(tmp_path / "wide.toml", "realistic", **slow)))
-    narrow = changed(wide, limits__position_min_rad=-0.4, limits__position_max_rad=0.4)
+    narrow = wide.changed(limits__position_min_rad=-0.4, limits__position_max_rad=0.4)
     static_Nm = static_friction_Nm(wide)
     assert static_Nm is not None
     plan = make_plan(wide, None)
@@ -340,7 +340,7 @@ def test_a_joint_that_the_spring_would_make_unstable_is_pulled_further(side: str
     require_margin(config_of_check(light, plan))
     with pytest.raises(MarginError):
         require_margin(config_of_check(light, dataclasses.replace(plan, travel_rad=TRAVEL_rad)))
-    narrow = changed(light, limits__position_min_rad=-0.1, limits__position_max_rad=0.1)
+    narrow = light.changed(limits__position_min_rad=-0.1, limits__position_max_rad=0.1)
     assert make_plan(narrow, None).travel_rad == pytest.approx(0.05)  # a quarter of the range
     found, _, fault = checked(light)
     assert fault is Fault.NONE

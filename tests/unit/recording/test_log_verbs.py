@@ -41,7 +41,6 @@ from jointctl.tools.session.plan import prepare_log, require_ready
 from jointctl.tools.session.run_watch import FrameRecorder, recording
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs.log import log_export, log_info, log_plot
-from tests.configurations import changed
 from tests.run_records import START_NS, eventful_records
 from tests.sessions import output
 
@@ -52,9 +51,7 @@ def in_folder(virtual_config: Config, tmp_path: Path) -> Callable[..., Config]:
     """configs/virtual.toml with its logs in the test's folder."""
 
     def build(**log: Any) -> Config:
-        config = changed(
-            virtual_config, **{f"log__{key}": value for key, value in {"folder": str(tmp_path), **log}.items()}
-        )
+        config = virtual_config.changed(log={"folder": str(tmp_path), **log})
         config._path = virtual_config.path
         return config
 
@@ -393,7 +390,7 @@ def test_a_recorder_that_nobody_fetches_from_drops_and_counts(queue: int, kept: 
 
 
 def test_frames_of_a_serial_line_are_refused(virtual_config: Any) -> None:
-    serial = changed(virtual_config, bus__interface="serial", log__frames=True)
+    serial = virtual_config.changed(bus__interface="serial", log__frames=True)
     with pytest.raises(ConfigurationError, match=r"log.frames \(=true\)"), recording(serial):
         pass
     with recording(virtual_config) as recorder:

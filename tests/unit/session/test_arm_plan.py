@@ -38,7 +38,6 @@ from jointctl.tools.session.plan import free, resolve, resolve_arm
 from jointctl.tools.verbs.bench_drive import stop_targets
 from jointctl.tools.verbs.check import check_arm
 from jointctl.tools.verbs.verb_options import on_bus
-from tests.configurations import changed
 from tests.sessions import output
 
 NAMES = ["shoulder", "elbow", "wrist"]
@@ -69,7 +68,7 @@ def test_the_envelope_names_every_joint_and_their_common_approach(arm: ArmConfig
 
 def test_the_gate_before_enabling_is_that_of_the_poses(arm: ArmConfig) -> None:
     """An inertia that no pose has: alone the joint would have its margin."""
-    wrong = replace(arm, joints=(*arm.joints[:2], changed(arm.joints[2], joint__inertia_kgm2=0.4)))
+    wrong = replace(arm, joints=(*arm.joints[:2], arm.joints[2].changed(joint__inertia_kgm2=0.4)))
     joints = resolve_arm(wrong).joints
     for joint in (*joints[:2], replace(joints[2], poses=None)):
         assert joint.require_margin(0.001, allow_low_margin=False).phase_margin_deg > 35.0
@@ -79,7 +78,7 @@ def test_the_gate_before_enabling_is_that_of_the_poses(arm: ArmConfig) -> None:
 
 
 def test_an_arm_that_a_joint_cannot_hold_is_refused_before_anything_is_sent(arm: ArmConfig) -> None:
-    weak = changed(arm.joints[0], limits__torque_max_Nm=30.0)
+    weak = arm.joints[0].changed(limits__torque_max_Nm=30.0)
     with pytest.raises(ConfigurationError, match="joint shoulder: gravity reaches 32"):
         resolve_arm(replace(arm, joints=(weak, *arm.joints[1:])))
 
@@ -143,7 +142,7 @@ def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
 def test_joints_that_one_loop_cannot_command_are_refused(arm: ArmConfig) -> None:
     joints = list(arm.joints)
     require_buses(joints)
-    joints[2] = changed(joints[2], bus__interface="slcan")
+    joints[2] = joints[2].changed(bus__interface="slcan")
     with pytest.raises(ConfigurationError, match="must be one of socketcan, jointctl") as caught:
         require_buses(joints)
     assert "wrist.toml" in str(caught.value)
@@ -303,9 +302,7 @@ def test_an_exchange_keeps_what_a_cycle_reads_near_and_no_long_arrays() -> None:
 def test_an_approach_that_ends_at_a_limit_is_allowed_from_everywhere(limit_rad: float) -> None:
     """Its polynomial ends there but for rounding."""
     hold = Hold(kind="hold", duration_s=1.0, position_rad=limit_rad)
-    config = changed(
-        load_config(shipped_config("virtual")), limits__position_min_rad=-0.7, limits__position_max_rad=0.7
-    )
+    config = load_config(shipped_config("virtual")).changed(limits__position_min_rad=-0.7, limits__position_max_rad=0.7)
     plan = resolve(config.changed(trajectory=hold))
     for start_rad in np.linspace(-0.7, 0.7, 60):
         plan.placed([report(float(start_rad))])

@@ -45,7 +45,6 @@ from jointctl.tools.session.session_drive import latched_text, session_drive
 from jointctl.tools.sweeping import carry_out
 from jointctl.tools.verbs import scope as scope_module
 from jointctl.tools.verbs.doctor import doctor_motion
-from tests.configurations import changed
 from tests.run_records import START_NS, WORDS, eventful_records, run_records
 
 # --- What the user is told of each fault: what happened with numbers, code and name, likely cause, next step ---
@@ -345,7 +344,7 @@ def test_an_unknown_emergency_code_is_told_by_its_class(code: int, name: str) ->
 
 # --- The end of a run: what is told first, and the exit code ---
 CONFIG = load_config(shipped_config("virtual"))
-WITHOUT_PICTURE = changed(CONFIG, log__picture=False)
+WITHOUT_PICTURE = CONFIG.changed(log__picture=False)
 
 REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
 
@@ -444,7 +443,7 @@ def test_no_verb_names_a_log_that_is_lost(tmp_path: Path, monkeypatch: pytest.Mo
     found, out, err = replace(result(tmp_path, Fault.NONE), log_lost=lost), io.StringIO(), io.StringIO()
     for module in (session_module, carry_out):
         monkeypatch.setattr(module, "Session", lambda *_: SimpleNamespace(run=lambda: found, drive_state="off"))
-    config = changed(CONFIG, log__folder=tmp_path)
+    config = CONFIG.changed(log__folder=tmp_path)
     output = Output(stdout=out, stderr=err)
     doctor_motion(config, output, assume_yes=True)
     assert (f"log: {tmp_path / 'run.mcap'}" in err.getvalue()) is not lost
@@ -465,7 +464,7 @@ def test_a_motion_that_measures_names_its_log_where_it_was_ended(
 ) -> None:
     found, err = replace(result(tmp_path, fault), stopped_by=by, log_lost=lost), io.StringIO()
     monkeypatch.setattr(carry_out, "Session", lambda *_: SimpleNamespace(run=lambda: found, drive_state="off"))
-    plan: Any = SimpleNamespace(config=changed(CONFIG, log__folder=tmp_path))
+    plan: Any = SimpleNamespace(config=CONFIG.changed(log__folder=tmp_path))
     with contextlib.nullcontext() if by else pytest.raises(MotionFault, match="no map"):
         assert carry_out.carried_out(plan, Output(stderr=err), "map", assume_yes=True, dry_run=False) == 130
     assert (f"log: {tmp_path / 'run.mcap'}" in err.getvalue()) is not lost

@@ -38,7 +38,6 @@ from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs import verb_options
 from jointctl.tools.verbs.verb_options import VerbOutput, grouped
-from tests.configurations import changed
 from tests.places import CONFIGS, ROOT
 from tests.python_process import eventually
 from tests.sessions import constants_of
@@ -109,7 +108,7 @@ def test_every_thread_keeps_off_the_loops_processor_from_its_go_to_its_end(monke
     def seen() -> list[set[int]]:
         return [os.sched_getaffinity(each) for each in (0, thread.native_id) if each is not None]
 
-    config = changed(load_config(CONFIGS / "virtual.toml"), loop__cpu=max(allowed))
+    config = load_config(CONFIGS / "virtual.toml").changed(loop__cpu=max(allowed))
     with LoopHandle(config, trajectory_table(config), CanopenPort) as loop:
         before = seen()
         loop.go(constants_of(config), new(CanopenPort))

@@ -16,7 +16,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.drawing import png
 from jointctl.tools.sweeping import excitation
 from jointctl.tools.sweeping.excitation import TORQUE_SHARE, Design, believed, designed, excitation_figure
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_a_longer_motion_tells_more_and_a_joint_without_load_cannot_tell_load_fr
     assert set(design.known) == {name.replace("log_ws", "ws") for name in believed(config)[0].names}
     longer = designed(config, 240.0, 1)
     assert longer.known["tc positive"] < design.known["tc positive"]
-    still = designed(changed(config, joint__gravity_Nm=0.0), 60.0, 1)
+    still = designed(config.changed(joint__gravity_Nm=0.0), 60.0, 1)
     assert still.known["load_coulomb"] > 2.0 * design.known["load_coulomb"]
     lines = [line for line in still.untold if line.startswith("load_coulomb: not expected")]
     assert lines
@@ -81,7 +81,7 @@ def test_a_longer_motion_tells_more_and_a_joint_without_load_cannot_tell_load_fr
 
 
 def test_a_joint_without_a_friction_model_gets_a_motion_too(config: Config) -> None:
-    bare = changed(config, friction=None)
+    bare = config.changed(friction=None)
     assert designed(bare, 60.0, 1).known["inertia"] < 0.5
 
 
@@ -97,7 +97,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
     config: Config, changes: dict[str, float], duration_s: float, text: str
 ) -> None:
     with pytest.raises(UsageError, match=text):
-        designed(changed(config, **changes), duration_s, 1)
+        designed(config.changed(**changes), duration_s, 1)
 
 
 def test_the_picture_shows_the_motion(design: Design) -> None:

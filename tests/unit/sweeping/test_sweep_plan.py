@@ -49,7 +49,7 @@ from jointctl.tools.sweeping.plan import (
 )
 from jointctl.tools.verbs.sweep import _speeds, sweep
 from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import changed, edited
+from tests.configurations import edited
 from tests.sessions import output
 
 # --- Grid, order and motion of a sweep: always inside travel and limits, windows only at constant speed ---
@@ -294,7 +294,7 @@ def config() -> Config:
 
 
 def limited(config: Config, **limits: float) -> Config:
-    return changed(config, **{f"limits__{key}": value for key, value in limits.items()})
+    return config.changed(limits=limits)
 
 
 def test_the_default_grid_has_the_papers_number_of_points_and_reaches_the_rated_speed(config: Config) -> None:

@@ -53,7 +53,7 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.joint_fit import Estimate, Gravity, fit_from_dict, fit_joint, fitted_again, gravity_of
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 T = 1e-3
 SOFT = TwoMasses(0.9, 1.3, 2.4e4, 15.0, (0.0, 0.0), (12.0, 0.0))
@@ -462,7 +462,7 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     attempts = [(100.0, "none"), (100.0, "desired"), (1600.0, "desired"), (3200.0, "desired")]
     assert laws == (attempts if weak else attempts[:1])
     laws.clear()
-    light = changed(before, joint__inertia_kgm2=0.5)
+    light = before.changed(joint__inertia_kgm2=0.5)
     with pytest.raises(MotionFault, match=fault.name):
         response_by_any_law(light, 8, carrier, 55.0)
     late = fault == Fault.LIMIT_CYCLE and value > HUNTING_Hz  # torque that is later than believed: not so stiff

@@ -28,7 +28,6 @@ from jointctl.tools.inspection.health import bus_budget
 from jointctl.tools.lockstep import DirectBus, LockstepJoint
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.virtual_joint import new_device
-from tests.configurations import changed
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, cycle, hear, port_of, short_run, tell
 
@@ -257,7 +256,7 @@ def test_the_bus_load_counts_the_second_position(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("rate_Hz", "refused"), [(2105.0, False), (2106.0, True)])
 def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
     """SYNC 55, TPDO 135, RPDO 95 and 95 bits; `doctor` reckons alike."""
-    config = changed(short_run(tmp_path, NODE), loop__rate_Hz=rate_Hz)
+    config = short_run(tmp_path, NODE).changed(loop__rate_Hz=rate_Hz)
     assert bus_budget(config).status == ("problem" if refused else "ok")
     if refused:
         with pytest.raises(ConfigurationError, match=re.escape("TPDO(8) + RPDO(4) + second encoder(4) = 380 bits")):

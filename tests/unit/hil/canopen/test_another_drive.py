@@ -16,7 +16,7 @@ from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs.hil import with_eds
 from jointctl.tools.virtual_joint import new_device
-from tests.configurations import changed, shipped, written
+from tests.configurations import shipped, written
 from tests.device_on_bus import DeviceOnBus
 from tests.eds_styles import EPOS4, EPOS4_KEYS, GOLD, NANOTEC, STYLES, U8, U16, U32, Listed, Style, eds_text
 from tests.virtual_drive import NODE, Rig
@@ -70,7 +70,7 @@ def test_what_commissioning_says(tmp_path: Path, style: Style) -> None:
     config = config_of(tmp_path, eds_text(style))
     drive = {"rated_torque_Nm": None, "rated_current_A": None, "torque_reference": style.reference, "mode": "auto"}
     drive[RATED[style.reference]] = getattr(config.drive, RATED[style.reference])
-    config = changed(config, **{f"drive__{key}": value for key, value in drive.items()})
+    config = config.changed(drive=drive)
     with DeviceOnBus(new_device(config)) as joint:
         joint.settings = dataclasses.replace(canopen_settings(config), boot_timeout_s=0.2)
         with joint.opened() as opened:
