@@ -164,13 +164,16 @@ class Config(Section):
         return self._path
 
     def changed(self, **changes: Any) -> Config:
-        """With `section__key=value`, or `section=` the keys of a mapping or another section; nothing is checked."""
+        """With `section__key=value`, or `section=` keys in a mapping, or another section; no value is checked."""
         update: dict[str, Any] = {}
         for path, value in changes.items():
             section, _, key = path.partition("__")
-            keys = {key: value} if key else value
-            own = update.get(section, getattr(self, section))
-            update[section] = own.model_copy(update=keys) if isinstance(keys, Mapping) else value
+            keys, own = {key: value} if key else value, update.get(section, getattr(self, section))
+            if isinstance(keys, Mapping):
+                if unknown := keys.keys() - type(own).model_fields.keys():
+                    raise TypeError(f"[{section}] has no {', '.join(sorted(unknown))}")
+                value = own.model_copy(update=keys)
+            update[section] = value
         return self.model_copy(update=update)
 
     def anchored(self) -> Config:

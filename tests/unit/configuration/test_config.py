@@ -400,6 +400,16 @@ def test_the_shipped_gains_are_carried_by_the_rate(config: Config, delay_s: floa
     assert require_margin(config, delay_s).phase_margin_deg > 25.0
 
 
+def test_changed_is_a_copy_with_these_keys_of_this_file(config: Config) -> None:
+    other = config.changed(limits__torque_max_Nm=3.0, limits__standstill_radps=0.2, control={"kp": 9.0}, friction=None)
+    assert (other.limits.torque_max_Nm, other.limits.standstill_radps, other.control.kp) == (3.0, 0.2, 9.0)
+    assert (other.friction, other.path, other.text) == (None, config.path, config.text)
+    assert other.changed(limits=config.limits, control=config.control, friction=config.friction) == config
+    for wrong in ({"limits__torque": 3.0}, {"control": {"kp": 9.0, "kq": 1.0}}):
+        with pytest.raises(TypeError, match=r"^\[(limits|control)\] has no (torque|kq)$"):
+            config.changed(**wrong)
+
+
 def test_gains_of_a_fast_bus_are_refused_naming_some_that_are_carried(config: Config) -> None:
     control = config.control.model_copy(update={"kp": 784.0, "kv": 56.0, "lyapunov_q": (1800.0,)})
     fast = config.changed(control=control)
