@@ -17,6 +17,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import (
     AxisPhase,
+    CommandKind,
     ControllerKind,
     DriveRequest,
     DriveState,
@@ -199,6 +200,39 @@ def tick_until(rig: Rig, tick: Callable[[], None], phase: AxisPhase, at_most: in
             break
         tick()
     assert rig.phase == phase, rig.state.fault
+
+
+class OwnLoopRig:
+    """A rig with an ideal drive: the joint is where the target of two cycles ago was, or as fast as is commanded.
+
+    `command`: values of its `VelocityCommandConstants`.
+    """
+
+    def __init__(self, rig: Any, kind: CommandKind, **command: float) -> None:
+        self.rig, self.kind = rig, kind
+        rig.axis.command_kind, rig.axis.trajectory.kind = kind, TrajectoryKind.SINE
+        for name, value in command.items():
+            setattr(rig.axis.velocity_command, name, value)
+        self.targets: list[float] = []
+        self.commands: list[float] = []
+        self.enabled: list[bool] = []
+
+    def tick(self, cycles: int = 1) -> None:
+        for _ in range(cycles):
+            joint, command = self.rig.joint, self.rig.command
+            if joint.drive_state == DriveState.ENABLED:
+                if self.kind is CommandKind.VELOCITY:
+                    joint.position_rad += float(command.velocity_radps) * PERIOD_s
+                elif len(self.targets) > 2 and self.enabled[-2]:
+                    joint.position_rad = self.targets[-2]
+            joint.velocity_radps = 0.0
+            self.rig.tick()
+            self.targets.append(float(self.rig.command.position_rad))
+            self.commands.append(float(self.rig.command.velocity_radps))
+            self.enabled.append(joint.drive_state == DriveState.ENABLED)
+
+    def until(self, phase: AxisPhase, at_most: int = 3000) -> None:
+        tick_until(self.rig, self.tick, phase, at_most)
 
 
 NewRig = Callable[..., Any]

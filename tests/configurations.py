@@ -29,6 +29,12 @@ def shipped(name: str = "virtual", **changes: Any) -> Config:
     return load_config(CONFIGS / f"{name}.toml").changed(**changes)
 
 
+def own_loop(mode: str = "csp", **cascade: Any) -> Config:
+    """The shipped csp.toml in this mode, with keys of [drive.cascade] changed."""
+    config: Any = shipped("csp")
+    return config.changed(drive__mode=mode, drive__cascade=config.drive.cascade.model_copy(update=cascade))
+
+
 def changed(config: Config, **changes: Any) -> Config:
     """See `Config.changed`."""
     return config.changed(**changes)

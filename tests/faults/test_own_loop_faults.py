@@ -12,25 +12,20 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
-from jointctl.tools.configuration.canopen import CanopenSection
-from jointctl.tools.configuration.config import Config
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from tests.configurations import shipped
+from tests.configurations import own_loop
 
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 DEAD_AT_s = 3.0
 
 
-def own_loop(mode: str, **cascade: Any) -> Config:
-    config = shipped("csp", trajectory__duration_s=6.0)
-    drive = config.drive
-    assert isinstance(drive, CanopenSection)
-    return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
+def short(mode: str, **cascade: Any) -> LockstepJoint:
+    return LockstepJoint(own_loop(mode, **cascade).changed(trajectory__duration_s=6.0))
 
 
 @pytest.fixture(scope="module", params=["csp", "csv"])
 def joint(request: pytest.FixtureRequest) -> LockstepJoint:
-    return LockstepJoint(own_loop(request.param))
+    return short(request.param)
 
 
 def rmse_mrad(run: LockstepRun) -> float:
@@ -39,15 +34,15 @@ def rmse_mrad(run: LockstepRun) -> float:
 
 
 def test_the_feed_forward_divides_the_following_error_of_the_drive_by_more_than_ten() -> None:
-    alone = LockstepJoint(own_loop("csp", torque_offset=False, velocity_offset=False, lead_s=0.0)).run()
-    everything = LockstepJoint(own_loop("csp")).run()
+    alone = short("csp", torque_offset=False, velocity_offset=False, lead_s=0.0).run()
+    everything = short("csp").run()
     assert rmse_mrad(alone) > 3.0  # the lag of a P position loop: speed / gain
     assert rmse_mrad(everything) < 0.1 * rmse_mrad(alone)
 
 
 def test_each_part_makes_it_better(joint: LockstepJoint) -> None:
     mode = joint.config.drive.mode  # type: ignore[attr-defined]
-    without_torque = LockstepJoint(own_loop(mode, torque_offset=False)).run()
+    without_torque = short(mode, torque_offset=False).run()
     assert rmse_mrad(joint.run()) < 0.5 * rmse_mrad(without_torque)
 
 

@@ -23,17 +23,10 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
-from tests.configurations import load, problems, shipped, written
+from tests.configurations import load, own_loop, problems, shipped, written
 from tests.places import CONFIGS
 
 CSP = (CONFIGS / "csp.toml").read_text()
-
-
-def own_loop(mode: str = "csp", **cascade: Any) -> Config:
-    config = shipped("csp")
-    drive = config.drive
-    assert isinstance(drive, CanopenSection)
-    return config.changed(drive__mode=mode, drive__cascade=drive.cascade.model_copy(update=cascade))
 
 
 def drive_of(config: Config) -> CanopenSection:

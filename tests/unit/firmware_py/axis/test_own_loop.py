@@ -28,9 +28,8 @@ from jointctl.firmware_py.states import (
     Fault,
     FeedForward,
     StopRequest,
-    TrajectoryKind,
 )
-from tests.axis_on_stub_joint import tick_until
+from tests.axis_on_stub_joint import OwnLoopRig
 
 PERIOD_s = 1e-3
 ACCELERATION_radps2 = 20.0
@@ -127,46 +126,19 @@ def test_the_velocity_command_leads_back_to_the_planned_motion(position_rad: flo
 
 
 # --- a whole run of the axis ---
-class OwnLoopRig:
-    """The shared rig with an ideal drive: the joint is where the target of two cycles ago was, or as fast."""
-
-    def __init__(self, rig: Any, kind: CommandKind) -> None:
-        self.rig, self.kind = rig, kind
-        axis = rig.axis
-        axis.command_kind = kind
-        axis.velocity_command.position_gain_ps = 20.0
-        axis.velocity_command.acceleration_max_radps2 = ACCELERATION_radps2
-        axis.velocity_command.lead_s = 2.0 * PERIOD_s
-        axis.velocity_command.feeds_torque = 1
-        axis.trajectory.kind = TrajectoryKind.SINE
-        self.targets: list[float] = []
-        self.enabled: list[bool] = []
-
-    def tick(self, cycles: int = 1) -> None:
-        for _ in range(cycles):
-            joint, command = self.rig.joint, self.rig.command
-            if joint.drive_state == DriveState.ENABLED:
-                if self.kind is CommandKind.VELOCITY:
-                    joint.position_rad += float(command.velocity_radps) * PERIOD_s
-                elif len(self.targets) > 2 and self.enabled[-2]:
-                    joint.position_rad = self.targets[-2]
-            joint.velocity_radps = 0.0
-            self.rig.tick()
-            self.targets.append(float(self.rig.command.position_rad))
-            self.enabled.append(joint.drive_state == DriveState.ENABLED)
-
-    def until(self, phase: AxisPhase, at_most: int = 3000) -> None:
-        tick_until(self.rig, self.tick, phase, at_most)
+def own_loop(rig: Any, kind: CommandKind) -> OwnLoopRig:
+    values = {"position_gain_ps": 20.0, "acceleration_max_radps2": ACCELERATION_radps2, "lead_s": 2.0 * PERIOD_s}
+    return OwnLoopRig(rig, kind, **values, feeds_torque=1)
 
 
 @pytest.fixture(params=[CommandKind.POSITION, CommandKind.VELOCITY], ids=["csp", "csv"])
 def own(rig: Callable[..., Any], request: pytest.FixtureRequest) -> OwnLoopRig:
-    return OwnLoopRig(rig(0.05), request.param)
+    return own_loop(rig(0.05), request.param)
 
 
 @pytest.fixture
 def csp(rig: Callable[..., Any]) -> OwnLoopRig:
-    return OwnLoopRig(rig(0.05), CommandKind.POSITION)
+    return own_loop(rig(0.05), CommandKind.POSITION)
 
 
 def test_a_joint_is_tracked_without_lag_stopped_and_disabled(own: OwnLoopRig) -> None:

@@ -20,12 +20,10 @@ from jointctl.firmware_py.states import (
     AxisPhase,
     CommandKind,
     DriveRequest,
-    DriveState,
     Fault,
     StopRequest,
-    TrajectoryKind,
 )
-from tests.axis_on_stub_joint import tick_until
+from tests.axis_on_stub_joint import OwnLoopRig
 
 PERIOD_s = 1e-3
 
@@ -63,36 +61,12 @@ def test_what_is_not_finite_is_zero_at_once(limits: Any, bad: float) -> None:
     assert limited_velocity_radps(limits, 10.0, bad, 1.0, PERIOD_s) == (0.0, False)
 
 
-class VelocityRig:
-    """The shared rig with an ideal drive in velocity mode: the joint follows the command of the cycle before."""
-
-    def __init__(self, rig: Any) -> None:
-        self.rig = rig
-        axis = rig.axis
-        axis.command_kind = CommandKind.VELOCITY
-        axis.velocity_command.position_gain_ps = 5.0
-        axis.velocity_command.acceleration_max_radps2 = 60.0
-        axis.trajectory.kind = TrajectoryKind.SINE
-        self.commands: list[float] = []
-
-    def tick(self, cycles: int = 1) -> None:
-        for _ in range(cycles):
-            if self.rig.joint.drive_state == DriveState.ENABLED:
-                self.rig.joint.position_rad += float(self.rig.command.velocity_radps) * PERIOD_s
-            self.rig.joint.velocity_radps = 0.0
-            self.rig.tick()
-            self.commands.append(float(self.rig.command.velocity_radps))
-
-    def until(self, phase: AxisPhase, at_most: int = 3000) -> None:
-        tick_until(self.rig, self.tick, phase, at_most)
-
-
 @pytest.fixture
-def velocity(rig: Callable[..., Any]) -> VelocityRig:
-    return VelocityRig(rig(0.05))
+def velocity(rig: Callable[..., Any]) -> OwnLoopRig:
+    return OwnLoopRig(rig(0.05), CommandKind.VELOCITY, position_gain_ps=5.0, acceleration_max_radps2=60.0)
 
 
-def test_a_joint_is_tracked_stopped_and_disabled_by_velocity_alone(velocity: VelocityRig) -> None:
+def test_a_joint_is_tracked_stopped_and_disabled_by_velocity_alone(velocity: OwnLoopRig) -> None:
     velocity.until(AxisPhase.TRACKING)
     velocity.tick(500)
     error_rad = velocity.rig.state.measured_position_rad - velocity.rig.state.reference.position_rad
@@ -105,7 +79,7 @@ def test_a_joint_is_tracked_stopped_and_disabled_by_velocity_alone(velocity: Vel
     assert np.max(np.abs(np.diff(velocity.commands))) <= 60.0 * PERIOD_s + 1e-12
 
 
-def test_nothing_is_commanded_before_the_drive_is_enabled_and_after_release(velocity: VelocityRig) -> None:
+def test_nothing_is_commanded_before_the_drive_is_enabled_and_after_release(velocity: OwnLoopRig) -> None:
     velocity.until(AxisPhase.APPROACH)
     assert set(velocity.commands[:-1]) == {0.0}
     velocity.tick(50)
@@ -116,7 +90,7 @@ def test_nothing_is_commanded_before_the_drive_is_enabled_and_after_release(velo
     assert velocity.rig.command.request == DriveRequest.QUICK_STOP
 
 
-def test_a_velocity_that_is_not_finite_stops_the_joint(velocity: VelocityRig) -> None:
+def test_a_velocity_that_is_not_finite_stops_the_joint(velocity: OwnLoopRig) -> None:
     velocity.until(AxisPhase.TRACKING)
     velocity.rig.axis.velocity_command.position_gain_ps = math.nan
     velocity.tick(1)
@@ -124,7 +98,7 @@ def test_a_velocity_that_is_not_finite_stops_the_joint(velocity: VelocityRig) ->
     assert velocity.commands[-1] == 0.0
 
 
-def test_its_twin_a_velocity_of_an_enormous_but_finite_gain_is_limited(velocity: VelocityRig) -> None:
+def test_its_twin_a_velocity_of_an_enormous_but_finite_gain_is_limited(velocity: OwnLoopRig) -> None:
     velocity.until(AxisPhase.TRACKING)
     before_radps = velocity.commands[-1]
     velocity.rig.axis.velocity_command.position_gain_ps = 1e300
@@ -134,7 +108,7 @@ def test_its_twin_a_velocity_of_an_enormous_but_finite_gain_is_limited(velocity:
 
 
 @pytest.mark.parametrize(("torque_Nm", "trips"), [(59.9, False), (-59.9, False), (60.0, True), (-60.0, True)])
-def test_a_drive_at_the_torque_limit_for_too_long_trips(velocity: VelocityRig, torque_Nm: float, trips: bool) -> None:
+def test_a_drive_at_the_torque_limit_for_too_long_trips(velocity: OwnLoopRig, torque_Nm: float, trips: bool) -> None:
     velocity.until(AxisPhase.TRACKING)
     velocity.rig.sample.torque_Nm = torque_Nm
     velocity.tick(20)
@@ -144,7 +118,7 @@ def test_a_drive_at_the_torque_limit_for_too_long_trips(velocity: VelocityRig, t
 
 
 @pytest.mark.parametrize(("limit_share", "trips"), [(1.0 - 1e-9, True), (1.0, False)])
-def test_a_joint_that_does_not_follow_trips(velocity: VelocityRig, limit_share: float, trips: bool) -> None:
+def test_a_joint_that_does_not_follow_trips(velocity: OwnLoopRig, limit_share: float, trips: bool) -> None:
     """It stands still while the reference moves on evenly: the error of each cycle is known before."""
     velocity.until(AxisPhase.TRACKING)
     rig = velocity.rig
