@@ -517,9 +517,8 @@ class StopCall(contextlib.AbstractContextManager["StopCall"]):
             if not waited_for and not any(is_marked(pid, self._name) for pid in marked):
                 break
             time.sleep(POLL_S)
-        self.unended = ""
-        for holder in (one for one in waited_for if one.refused):
-            self.unended = f"the program that controls the bus (pid {holder.pid}) cannot be ended: {holder.refused}"
+        goes_on = "the program that controls the bus (pid {0.pid}) cannot be ended: {0.refused}"
+        self.unended = "; ".join(goes_on.format(holder) for holder in waited_for if holder.refused)
         self._end_by_force(note)
         if controllers or marked:
             ended()

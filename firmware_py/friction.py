@@ -273,8 +273,8 @@ def step_lugre(
 # and of a joint that is not rigid, whose gains are too low to hold it, by half at once.  They spring back by what they
 # were let go of, over their stiffness as it was found (`_share_kept`).  There the joint is a spring, and for a moment
 # an integrator of that stiffness takes a rigid one back; for longer it would swing between two counts.  An adapting law
-# holds it `BEHIND` of a count behind its place, away from the edge that it would creep over, and lets go by `UNSEEN`
-# of a count less than the reading shows: where a count begins to show, the joint has only come over its edge.
+# holds it `BEHIND` of a count behind its place, away from the edge that it would creep over, and from there lets go by
+# `UNSEEN` of a count less than it is seen to go on: where a count begins to show, it has only come over the edge.
 # Of a joint that is not rigid the observer is slow as well: what it has found on arrival is mostly friction of this
 # direction.  It keeps the mean of both directions, which is a load.
 #

@@ -35,11 +35,6 @@ def own_loop(mode: str = "csp", **cascade: Any) -> Config:
     return config.changed(drive__mode=mode, drive__cascade=config.drive.cascade.model_copy(update=cascade))
 
 
-def changed(config: Config, **changes: Any) -> Config:
-    """See `Config.changed`."""
-    return config.changed(**changes)
-
-
 def edited_file(folder: Path, *changes: tuple[str, str], base: str = "virtual") -> Path:
     """A shipped file with pieces of text replaced, each of which is there exactly once."""
     text = (CONFIGS / f"{base}.toml").read_text()

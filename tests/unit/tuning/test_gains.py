@@ -38,7 +38,7 @@ from jointctl.tools.experiments.controller_study import EnsembleSettings, random
 from jointctl.tools.tuning.carry_out import with_slow_observer
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
 from jointctl.tools.virtual_joint import plant_settings
-from tests.configurations import changed, shipped
+from tests.configurations import shipped
 
 NAMES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
          "delay_s", "lag_s", "late_s")  # fmt: skip
@@ -92,7 +92,7 @@ def test_a_joint_that_friction_rules_gets_a_stiffer_loop_that_passes_the_gate(
     assert usual.best.error > between.best.error > sticky.best.error
     assert usual.best.error > times * sticky.best.error
     assert (sticky.goals.phase_margin_deg, sticky.goals.gain_margin, sticky.goals.sensitivity) == STICKY
-    assert margins(loop_settings(changed(config, control=sticky.control))[0]).phase_margin_deg >= 30.0
+    assert margins(loop_settings(config.changed(control=sticky.control))[0]).phase_margin_deg >= 30.0
     assert choose_gains(config, within).control == usual.control
 
 
@@ -102,7 +102,7 @@ def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> N
     config = known(shipped("precise"), fit)
     found = choose_gains(config, fit.intervals(), law)
     assert found.missed == {}
-    settings, _ = loop_settings(changed(config, control=found.control))
+    settings, _ = loop_settings(config.changed(control=found.control))
     for factor in (0.97, 1.0, 1.03):  # a heavier joint is a smaller gain
         judged = margins(replace(settings, inertia_kgm2=settings.inertia_kgm2, kp=settings.kp / factor))
         assert judged.phase_margin_deg > PHASE_MARGIN_deg - 0.5
@@ -149,7 +149,7 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate(
     _, config, found = two_encoders
     assert found.law.name == "two_encoders"
     assert found.control.kind == "flexible_joint"
-    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    judged = margins(loop_settings(config.changed(control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert found.best.settings.observer_radps < 120.0
     assert found.best.noise_Nm < 0.56  # 1.8 Nm were 3 % of this joint's torque
@@ -162,7 +162,7 @@ def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_
     found = choose_gains(config, fit.intervals())
     assert (found.law.name, found.control.kind, found.missed) == ("link_encoder", "flexible_joint", {})
     assert found.control.velocity_cutoff_Hz < 0.5 * fit.resonance_Hz.value
-    settings, _ = loop_settings(changed(config, control=found.control))
+    settings, _ = loop_settings(config.changed(control=found.control))
     assert margins(settings).phase_margin_deg >= config.margin.min_phase_margin_deg
     hardly_damped = margins(replace(settings, joints=tuple(lossless_joints(config))))
     assert hardly_damped.phase_margin_deg >= 0.5 * config.margin.min_phase_margin_deg
@@ -177,7 +177,7 @@ def test_a_soft_joint_with_the_motors_encoder_alone_gets_that_filter_where_it_is
     assert (found.law.name, found.missed) == ("precise", {})
     assert (found.control.velocity_cutoff_Hz < 20.0) is low
     assert found.control.kv > 6.0
-    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    judged = margins(loop_settings(config.changed(control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
 
 
@@ -198,7 +198,7 @@ def test_the_slower_observer_of_a_soft_joint_passes_the_gate_where_it_is_later_t
     two_encoders: tuple[JointFit, Config, ChosenGains],
 ) -> None:
     fit, config, found = two_encoders
-    config = changed(config, control=found.control)
+    config = config.changed(control=found.control)
     slower = with_slow_observer(config, fit.intervals(), 20.0)
     assert 20.0 < slower.control.observer_radps < config.control.observer_radps
     settings, _ = loop_settings(slower)
@@ -241,7 +241,7 @@ def test_a_joint_that_is_late_beside_its_resonance_gets_a_low_filter_and_passes_
     assert found.missed == {}
     assert found.control.velocity_cutoff_Hz < 40.0
     assert found.control.kv > 10.0
-    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    judged = margins(loop_settings(config.changed(control=found.control))[0])
     assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
     assert judged.sensitivity_peak <= config.margin.max_sensitivity
 
@@ -309,7 +309,7 @@ def test_a_joint_whose_loss_is_all_hysteresis_keeps_its_margin_without_it() -> N
     found = choose_gains(config, fit.intervals())
     assert found.missed == {}
     assert found.control.kv > 8.0
-    settings, _ = loop_settings(changed(config, control=found.control))
+    settings, _ = loop_settings(config.changed(control=found.control))
     for stiffness in (3.03e4, 3.6e4, 4.2e4, 6.06e4):
         joint = replace(fit.joint(), stiffness_Nmprad=stiffness, bristle_damping_Nmspr=(0.0, 0.0))
         joint = replace(joint, damping_Nmspr=0.02 * joint.critical_Nmspr)
