@@ -200,6 +200,20 @@ def test_a_stop_that_does_not_arrive_is_told(bench: Any, browser: Browser) -> No
     assert bench.disabled()
 
 
+def test_a_stop_that_is_answered_late_is_told_as_taken(bench: Any, browser: Browser) -> None:
+    scope, tab, _ = opened(bench, browser)
+    start(tab)
+    moves(tab)
+    server = scope.child("jointctl.tools.scoping.server")
+    os.kill(server, signal.SIGSTOP)
+    tab.click("stop")
+    tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP DID NOT ARRIVE')")
+    os.kill(server, signal.SIGCONT)
+    tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP taken')")
+    state_is(tab, "the run has ended")
+    assert bench.disabled()
+
+
 def panel(tab: Tab) -> str:
     """What the panel with Start and Prepare shows."""
     return str(tab.js("document.querySelector('[data-testid=\"start-panel\"]').innerText"))
@@ -455,6 +469,7 @@ def test_no_choice_is_lost_to_a_page_that_answers_late(bench: Any, browser: Brow
     tab.until(f"{shown} === 'desired angle [rad],angle [rad],command torque [Nm],velocity [rad/s],error [mrad]'")
     new = browser.open(url)  # whose colours are asked for while it comes up
     new.click("dark")
+    new.until("document.body.classList.contains('body--dark')")
     time.sleep(2.0)
     assert new.js("document.body.classList.contains('body--dark')")
 

@@ -38,10 +38,12 @@ _PRESSED = """window.jointctlStop = () => {
   const word = document.querySelector('[data-testid="stop-word"]')
   const tell = (text, bad) => { word.textContent = text; word.style.color = bad ? '#c62828' : 'inherit' }
   tell('…', false)
-  fetch('STOP_PATH', {method: 'POST', signal: AbortSignal.timeout(ANSWER_MS)})
+  const late = setTimeout(() => tell('NOT_TAKEN', true), ANSWER_MS)  // an answer that comes yet takes its place
+  fetch('STOP_PATH', {method: 'POST'})
     .then(answer => { if (!answer.ok) throw answer.status; return answer.text() })
     .then(text => { tell(text, false); setTimeout(() => word.textContent === text && tell('', false), 8000) })
     .catch(() => tell('NOT_TAKEN', true))
+    .finally(() => clearTimeout(late))
 }"""
 
 # What is pressed while the page is cut off, its library would send later, when no one expects it: it is refused.  Not
