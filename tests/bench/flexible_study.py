@@ -137,7 +137,7 @@ def _text(values: list[float]) -> str:
 
 
 def table(rows: list[Row]) -> None:
-    """The table of docs/law.md."""
+    """The table of docs/law-measured.md."""
     print(
         "| law, motion | RMSE, LuGre | stick-slip | peak | chatter [Nm a cycle] | faults |\n|---|---|---|---|---|---|"
     )
