@@ -24,7 +24,7 @@ _HOME = re.compile(r"^    (from jointctl\.tools\.\S+ import \w+)$", re.MULTILINE
 def _annotation(kind: object) -> str:
     """As a caller may give it: a text for a path as well."""
     text = kind if isinstance(kind, str) else inspect.formatannotation(kind)
-    return re.sub(r"\b(pathlib\.)?Path\b", "str | Path", text)
+    return re.sub(r"\b(pathlib\.(_local\.)?)?Path\b", "str | Path", text)  # `_local`: Python 3.13
 
 
 def _default(value: object) -> str:
