@@ -107,7 +107,10 @@ class StopSignals:
         self.looked_ns = self.looked_ns or self.agreed_ns
 
     def begin(self) -> None:
-        """As `look`, just before a loop is let go: also where this program has waited since the yes, as for a disk."""
+        """As `look`, before a loop is let go, and before it may enable: also where this program has waited since.
+
+        As for a disk, or for margins that take a slow computer long.
+        """
         if (waited_s := (now_ns() - self.agreed_ns) * 1e-9) > STOOD_S:
             self.stood_s = waited_s
         self.look()
@@ -117,7 +120,8 @@ class StopSignals:
         self.note_standstill()
         if self.stood_s:
             raise MotionFault(
-                f"this program or the computer stood still for {self.stood_s:.0f} s after the motion was agreed to",
+                f"this program or the computer stood still, or was too slow, for {self.stood_s:.0f} s after the motion "
+                "was agreed to",
                 "nothing moves: start again",
             )
 

@@ -488,6 +488,7 @@ class RunWatch:
         """Once the delay allows the gains, and what stops the drive without us was read back."""
         guard, judged = self.settings_guard, self.delay_s is not None and self._margins is None
         if not self._allowed and judged and (guard is None or guard.confirmed):
+            self.around.signals.begin()  # margins that have taken long: no one expects the motion any more
             self._allowed = True
             self.loop.allow_enable()
 

@@ -1,8 +1,9 @@
-"""The margins of a loop are computed while its drives are off: however long that takes, it is no fault of anyone."""
+"""The margins of a loop are computed while its drives are off: no one waits for them but the user's yes."""
 
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import MarginError
+from jointctl.drivers.errors import MarginError, MotionFault
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.tools.output import Output
+from jointctl.tools.session import control
 from jointctl.tools.session import plan as run_plan
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
@@ -62,7 +64,9 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
 def watch_of(tmp_path: Path, loop: Any, said: list[str]) -> RunWatch:
     config = shipped()
     log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda _, __, text: said.append(text))
-    around, plan = Around(StopSignals(), BusWatch(config, None)), resolve(config)
+    signals = StopSignals()
+    signals.agreed()
+    around, plan = Around(signals, BusWatch(config, None)), resolve(config)
     kept: Any = None
     axis: Any = SimpleNamespace(command_kind=0)
     return RunWatch(plan, axis, RunParts(loop, around, log, kept, PhaseLines(Output(quiet=True)), {}))
@@ -105,6 +109,25 @@ def test_margins_that_are_refused_end_the_run(tmp_path: Path, slow: Slow) -> Non
         look(watch)
     assert not loop.may_enable
     assert not said
+
+
+@pytest.mark.parametrize(("took_s", "refused"), [(31, True), (29, False)])
+def test_a_yes_does_not_outlast_margins_that_take_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: Slow, took_s: int, refused: bool
+) -> None:
+    """The supervisor went on looking, so it was no standstill: the joint moved as long after the yes as they took."""
+    loop, now_ns, late = Loop(), control.now_ns, [0]
+    monkeypatch.setattr(control, "now_ns", lambda: now_ns() + late[0])
+    watch = watch_of(tmp_path, loop, [])
+    look(watch)
+    for _ in range(took_s):
+        late[0] += 10**9
+        watch.around.signals.note_standstill()  # as its thread does once a second
+    slow.released.set()
+    watch._margins.result(AT_MOST_s)
+    with pytest.raises(MotionFault, match="too slow, for 31 s") if refused else nullcontext():
+        look(watch)
+    assert loop.may_enable is not refused
 
 
 def test_a_wait_for_a_drive_that_is_silent_is_no_loop_delay_of_its_neighbours(tmp_path: Path, slow: Slow) -> None:

@@ -222,7 +222,9 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
     loop: Any = SilentLoop(samples, owed_cycles)
     nothing: Any = None
-    parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
+    signals = StopSignals()
+    signals.agreed()
+    parts = RunParts(loop, Around(signals, BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
     plan = resolve(config)
     axis = plan.motion.placed(report()).constants[0]
     if velocity:
