@@ -152,11 +152,11 @@ class LiveMotor:
                 import_module(name)
             while not self._approval.asked.wait(POLL_S):
                 self.require()
+            self._began_ns = time.monotonic_ns()  # the last call: an interrupt behind it finds the block entered
         except BaseException:
             self._end()
             self._stack.close()
             raise
-        self._began_ns = time.monotonic_ns()
 
     def _motion(self, config: Config) -> FreeMotion:
         self._motions.append(FreeMotion(config, np.zeros((TABLE_ROWS, 5)), by_program=True))
@@ -311,7 +311,10 @@ class LiveMotor:
         Ctrl-C asks for more, as in `jointctl run`.
         """
         control, thread = self._control, self._thread
-        if control is None or thread is None or thread.ident is None:
+        if control is None or thread is None:
+            return
+        self._ask_end()  # also of a thread whose `start` was interrupted: it may have no number yet, and begin later
+        if thread.ident is None:
             return
         signals = control.signals
         raised: BaseException | None = None

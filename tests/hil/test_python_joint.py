@@ -359,6 +359,36 @@ def test_an_enable_that_is_interrupted_ends_the_run_whatever_the_program_does_th
     assert bench.disabled()
 
 
+INTERRUPTED_AT_THE_END = """
+import sys, time
+from types import SimpleNamespace
+import jointctl
+from jointctl import live_joint
+
+def interrupted():
+    live_joint.time = time
+    raise KeyboardInterrupt
+
+live_joint.time = SimpleNamespace(**{**vars(time), "monotonic_ns": interrupted})
+try:
+    with jointctl.Joint("joint.toml"):
+        print("entered", file=sys.stderr, flush=True)
+except KeyboardInterrupt:
+    print("interrupted", file=sys.stderr, flush=True)
+with jointctl.Joint("joint.toml") as joint:
+    print(joint.state.phase, file=sys.stderr, flush=True)
+"""
+
+
+def test_a_commissioning_that_is_interrupted_at_its_very_end_leaves_the_bus(bench: Any) -> None:
+    """Its session had the bus until the program ended: no block was entered that could be left."""
+    bench.with_joint()
+    ended = bench.program(INTERRUPTED_AT_THE_END).finished(60.0)
+    assert ended.code == 0, ended.err
+    assert ended.err.split()[-2:] == ["interrupted", "commissioned"]
+    assert bench.disabled()
+
+
 def test_a_second_program_is_refused_by_name(bench: Any) -> None:
     program = started(bench, "joint.wait(60.0)").saw("enabled")
     second = bench.run("run", "joint.toml", "-y")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from pathlib import Path
 from shutil import copytree
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from jointctl.joint import Joint
 from jointctl.program import Wanted, axes_of, wanted_source
 from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.session.control import Control, StopSignals
 from tests.configurations import written
 
 pytestmark = pytest.mark.usefixtures("old_program")
@@ -154,3 +156,12 @@ def test_a_session_is_over_even_where_its_bus_cannot_be_given_back() -> None:
     with pytest.raises(OSError, match="no such file"):
         motor._run()
     assert (motor._over, motor.result) == (True, "done")
+
+
+def test_a_session_whose_start_was_interrupted_finds_that_it_is_to_end() -> None:
+    """Python may be interrupted in `Thread.start` with the thread on its way, not yet known by its number."""
+    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
+    motor._over, motor._thread, motor._control = False, threading.Thread(), Control(StopSignals(wake=lambda: None))
+    motor._end()
+    with pytest.raises(KeyboardInterrupt):
+        motor._control.signals.leave_if_asked()  # before anything is sent
