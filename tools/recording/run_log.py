@@ -372,6 +372,7 @@ class RunLogWriter(AbstractContextManager["RunLogWriter"]):
             raise DataError(f"{self.path}: exists already, a log is never overwritten") from None
         except OSError as error:
             raise DataError(f"{self.path}: cannot be created: {error.strerror or error}") from None
+        _lock(self._file)
         try:
             with writing(self.path):
                 self._begin(metadata, joints)
@@ -531,8 +532,9 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     """Keep the newest `log.keep` runs of this configuration, `path` counted as one; returns what was removed.
 
     A run is its log with the pictures and pages beside it, by name; nothing else in the folder is touched.  Of an arm
-    the logs of each joint count by themselves.  None is removed while one is of a time that is still to come: the
-    calendar clock was set back, and what looks oldest may be the newest.
+    the logs of each joint count by themselves.  A run that goes on, as on another bus, keeps its log.  None is removed
+    while one is of a time that is still to come: the calendar clock was set back, and what looks oldest may be the
+    newest.
     """
     if not config.log.keep or not path.parent.is_dir():
         return []
@@ -549,10 +551,29 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     if max(ended_s.values(), default=0.0) > time.time() + CLOCKS_APART_S:
         return []
     oldest_first = sorted(runs, key=ended_s.__getitem__)
-    removed = [file for run in oldest_first[: max(0, len(runs) + 1 - config.log.keep)] for file in runs[run]]
+    outdated = [runs[run] for run in oldest_first[: max(0, len(runs) + 1 - config.log.keep)]]
+    removed = [file for files in outdated if not any(map(_is_being_written, files)) for file in files]
     for file in removed:
         file.unlink()
     return removed
+
+
+def _lock(file: IO[bytes]) -> bool:
+    """Until it is closed; False where someone has it already.  A system, or a file system, may have no such locks."""
+    try:
+        from fcntl import LOCK_EX, LOCK_NB, flock
+
+        flock(file, LOCK_EX | LOCK_NB)
+    except (ImportError, OSError) as error:
+        return not isinstance(error, BlockingIOError)
+    return True
+
+
+def _is_being_written(file: Path) -> bool:
+    """Whether a `RunLogWriter`, of another program as well, has it open."""
+    with suppress(OSError), file.open("rb") as found:
+        return not _lock(found)
+    return False
 
 
 class ThinnedRecords:

@@ -117,6 +117,18 @@ def test_none_is_removed_after_the_clock_was_set_back(
     assert len(names(tmp_path)) == left
 
 
+def test_a_run_that_goes_on_keeps_its_log(in_folder: Callable[..., Config], tmp_path: Path) -> None:
+    """A second run of the same file, on another bus, removed the log of the first, which then was lost."""
+    aged(tmp_path, 2)
+    config = in_folder(keep=1)
+    first = log_path(config)
+    with RunLogWriter(first, {}):
+        os.utime(first, (0, 0))  # the oldest of all
+        assert len(remove_oldest(config, tmp_path / "virtual-20991231-120000.mcap")) == 6
+        assert names(tmp_path) == [first.name]
+    assert remove_oldest(config, tmp_path / "virtual-20991231-120000.mcap") == [first]  # its twin: it is over
+
+
 def test_files_that_are_not_runs_of_this_configuration_stay(in_folder: Callable[..., Config], tmp_path: Path) -> None:
     others = ["virtual-notes.mcap", "other-20260101-120000.mcap", "virtual-20260101-120000.csv",
               "my-virtual-20260101-120000.png"]  # fmt: skip
