@@ -44,7 +44,8 @@ class StopSignals:
         self.name = ""  # of the first signal, or STOP_COMMAND
         self.raising = raising
         self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
-        self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
+        # a stop reaches a loop that runs at once, and not with the supervisor's next look
+        self.on_command: Callable[[StopRequest], None] = lambda _: None
         self._again = False  # the next signal is no new one
         self.looked_ns: int | None = None  # by `now_ns`; from the user's yes on, which may be for several motions
         self.stood_s = 0.0  # since then, if it was long
@@ -74,6 +75,7 @@ class StopSignals:
         else:
             self.count += 1
             self.name = self.name or signal.Signals(number).name
+            self.on_command(self.request)
         if self.raising:
             raise KeyboardInterrupt
 
