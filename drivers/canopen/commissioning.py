@@ -59,6 +59,7 @@ STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the l
 STEEP_PERMILLE_PS = 1_000_000
 TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"
 LONGEST_PERIOD = 255  # of 60C2:1
+POSITION_INVERTED, VELOCITY_INVERTED = 0x80, 0x40  # of 607E
 WITHOUT_6007 = "no object 6007 (abort connection option): when this computer dies, in mode"
 MAX_TORQUE, TORQUE_LIMIT = "max torque", "torque limit"
 RATED_PERMILLE = 1000.0
@@ -254,6 +255,27 @@ def require_reaction(objects: ObjectAccess, settings: CanopenSettings) -> None:
         raise DeviceError(
             f"node {settings.node} has {WITHOUT_6007} {settings.mode} it may go on holding or turning the joint",
             'drive.mode = "cst" if it has that mode, `sweep --mode torque`; such a drive is not enabled in this one',
+        )
+
+
+def require_one_direction(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """Where a velocity is commanded, it must count in the direction of 6064, or the joint would turn the other way."""
+    if findings.mode is Mode.CYCLIC_SYNC_POSITION and not settings.velocity_offset:
+        return
+    polarity = objects.read_if_present(0x607E, what="polarity") or 0
+    inverted = [
+        word for bit, word in ((POSITION_INVERTED, "positions"), (VELOCITY_INVERTED, "velocities")) if polarity & bit
+    ]
+    if len(inverted) == 1:
+        raise DeviceError(
+            f"node {settings.node}: 607E (polarity) is {polarity:02X}h, which inverts {inverted[0]} alone: in mode "
+            f"{settings.mode} the joint would turn away from where it is commanded",
+            "clear its bits 6 and 7 in the maker's software and check encoder.direction; a mode of torque does without",
+        )
+    if inverted:
+        findings.remarks.append(
+            f"607E is {polarity:02X}h: positions and velocities are inverted, as some drives do in some modes only: "
+            "clear it, and check encoder.direction"
         )
 
 
@@ -517,6 +539,7 @@ def commission(
     limit_torque(objects, settings, findings)
     if findings.mode in TARGETS:
         require_reaction(objects, settings)
+        require_one_direction(objects, settings, findings)
     if settings.holds_alone:
         require_own_loop(objects, settings, findings)
     if findings.mode in TARGETS:

@@ -157,6 +157,40 @@ def test_a_position_that_the_drive_scales_is_told_in_every_mode(
     assert [line[:4] for line in remarks if line[:4] in ("6091", "6092")] == indices
 
 
+POLARITY = "\n[607E]\nObjectType=7\nDataType=5\nAccessType=rw\n"
+
+
+def inverting(joint: Any, polarity: int) -> str:
+    """The EDS of a drive with that polarity."""
+    sample = joint.device.objects.entries[0x1001, 0]
+    joint.device.objects.entries[0x607E, 0] = replace(sample, index=0x607E, default=polarity)
+    return EDS.read_text() + POLARITY
+
+
+@pytest.mark.parametrize("mode", [{"mode": "csv"}, {"mode": "pv"}, OWN_LOOP])
+@pytest.mark.parametrize(("polarity", "inverted"), [(0x80, "positions"), (0x40, "velocities")])
+def test_a_velocity_that_counts_the_other_way_than_the_position_is_refused(
+    commission: Any, joint: Any, mode: dict[str, Any], polarity: int, inverted: str
+) -> None:
+    """The joint turned away from its reference until the following error had tripped."""
+    with pytest.raises(DeviceError, match=rf"607E \(polarity\) is {polarity:02X}h, which inverts {inverted} alone"):
+        commission(eds=inverting(joint, polarity), **mode)
+
+
+@pytest.mark.parametrize(
+    ("polarity", "mode", "remarks"),
+    [
+        (0x00, {"mode": "csv"}, 0), (0xC0, {"mode": "csv"}, 1), (0x40, {"mode": "cst"}, 0),
+        (0x40, {**OWN_LOOP, "velocity_offset": False}, 0),
+    ],
+)  # fmt: skip
+def test_its_twins_whose_directions_agree_or_do_not_matter(
+    commission: Any, joint: Any, polarity: int, mode: dict[str, Any], remarks: int
+) -> None:
+    found = commission(eds=inverting(joint, polarity), **mode).remarks
+    assert sum("positions and velocities are inverted" in line for line in found) == remarks
+
+
 def test_a_drive_that_does_not_tell_its_scale_is_commissioned_with_a_remark(commission: Any, joint: Any) -> None:
     joint.unread.update({(index, sub): 0x08000022 for index in (0x6091, 0x6092) for sub in (1, 2)})
     remarks = commission(eds=EDS.read_text() + SCALED, mode="cst").remarks
