@@ -304,8 +304,10 @@ class Session:
             if not stop_has_come(signals, self.plan.configs) and not self._explained_by_restart(error, loop):
                 self._log_end(watches, error)
                 raise MotionFault(error.message, error.hint) from None
-        except BaseException:
+        except BaseException as error:
             self._brake(loop, watch)
+            if isinstance(error, DataError):  # a disk that is full, say
+                error.message += "; the motion was ended for it"
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         for each in watches:
