@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.hil.moving_run import ENABLED, QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED, Moving, gone
 from tests.python_process import eventually
 
@@ -31,6 +33,20 @@ def test_supervisor_killed_the_loop_ramps_down_by_itself(moving: Any) -> None:
     assert QUICK_STOP_ACTIVE not in states
     assert moving.witness.largest_speed_radps(moving.since_s) < 0.5  # the trajectory has 0.22
     assert moving.bench.disabled()
+
+
+def test_the_death_of_the_supervisor_is_not_waited_for_as_its_silence_is(bench: Any) -> None:
+    """The joint went on for `supervisor_timeout_s`, and one that was about to be enabled still was."""
+    config = bench.with_joint(trajectory__duration_s=60.0, sequence__supervisor_timeout_s=60.0)
+    run = bench.start("run", config, "-y").saw("  tracking")
+    (loop,) = run.children()
+    run.signal(signal.SIGKILL)
+    assert gone(loop, 30.0)
+    (tail,) = bench.folder.glob("runs/*.tail.mcap")
+    records = read_run_log(tail).records
+    assert (records.fault[-1], records.phase[-1]) == (Fault.SUPERVISOR_LOST, AxisPhase.FINISHED)
+    assert AxisPhase.RELEASING in records.phase  # it braked under control
+    assert bench.disabled()
 
 
 def test_supervisor_stopped_the_loop_ramps_down_and_it_is_told_afterwards(moving: Any) -> None:

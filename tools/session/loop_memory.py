@@ -193,6 +193,14 @@ class LoopOrder:
 
     def supervisor_gone(self) -> bool:
         """It has ended, or its process has become another program's (exec), which keeps the number."""
+        return os.getppid() != self.supervisor_pid or bool(self._end().poll(0))
+
+    def until_supervisor_gone(self) -> None:
+        """Returns when it has; where a process that it has forked lives on with its end of the pipe, when that ends."""
+        self._end().poll()
+
+    def _end(self) -> select.poll:
+        """Of the pipe: it has news when no one has the other one."""
         poll = select.poll()
         poll.register(self.supervisor_fd, 0)
-        return os.getppid() != self.supervisor_pid or bool(poll.poll(0))
+        return poll

@@ -2,9 +2,9 @@
 
 The loop is the compiled one where the bus is a file descriptor, else the plain Python one of `portable_loop`.
 
-Signals that a terminal sends are blocked here: stopping is the supervisor's word, and if the supervisor dies the
-loop sees its silence and stops the joint.  If this process dies, its heartbeat on the bus ends and the drive stops
-the joint.
+Signals that a terminal sends are blocked here: stopping is the supervisor's word.  If the supervisor dies, the loop
+stops the joint at once; if it hangs, when it has been silent for too long.  If this process dies, its heartbeat on the
+bus ends and the drive stops the joint.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ from jointctl.tools.wake_up import cores_awake
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
+LONG_AGO_NS = -(1 << 60)  # CLOCK_MONOTONIC
 
 
 def _block_signals() -> None:
@@ -60,11 +62,18 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
     return refused
 
 
+def _await_death(order: LoopOrder, block: SharedBlock) -> None:
+    """A supervisor that has died is silent from then on: for the loop, since long ago."""
+    order.until_supervisor_gone()
+    block.words[Word.SUPERVISOR_NS] = LONG_AGO_NS
+
+
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
     port, loop = loop_of(order.kind)
     block = SharedBlock(order.block_fd, order.table_rows, port, order.axes, order.links)
 
+    threading.Thread(target=_await_death, args=(order, block), name="death of the supervisor", daemon=True).start()
     gc.disable()
     with slow_start(say, "loop"), loop(order, block) as ready:
         gc.freeze()
