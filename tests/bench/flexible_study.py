@@ -34,20 +34,18 @@ from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import law_resolution_rad  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, quantile, random_plant  # noqa: E402
-from jointctl.tools.experiments.controllers import (  # noqa: E402
+from jointctl.tools.experiments.scenarios import (  # noqa: E402  # noqa: E402
+    RANDOM_MOTIONS,
     Controller,
+    ErrorFigures,
+    Scenario,
     changed,
     controller_config,
     controller_constants,
-    with_chosen_gains,
-)
-from jointctl.tools.experiments.scenarios import (  # noqa: E402
-    RANDOM_MOTIONS,
-    ErrorFigures,
-    Scenario,
     error_figures,
     random_motion,
     run_scenario,
+    with_chosen_gains,
 )
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 

@@ -51,8 +51,8 @@ from jointctl.tools.configuration.found_values import with_values  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.configuration.sections import Friction, Virtual  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
-from jointctl.tools.experiments.controllers import Controller  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
+from jointctl.tools.experiments.scenarios import Controller  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
 from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402

@@ -23,8 +23,8 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments import many_runs
 from jointctl.tools.experiments.campaign import run_campaign
 from jointctl.tools.experiments.controller_study import StudySettings, run_study
-from jointctl.tools.experiments.controllers import named
 from jointctl.tools.experiments.many_runs import Workers, require_protected
+from jointctl.tools.experiments.scenarios import named
 from tests.browser import free_port
 
 needs_distributed = pytest.mark.skipif(

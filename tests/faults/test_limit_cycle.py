@@ -12,7 +12,7 @@ import pytest
 from jointctl.firmware_py.states import AxisPhase, Fault, Notice, Reaction
 from jointctl.hil.lockstep import TRUE_POSITION_rad
 from jointctl.tools.configuration.sections import Hold
-from jointctl.tools.experiments.controllers import controller_constants, named
+from jointctl.tools.experiments.scenarios import controller_constants, named
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
 from tests.configurations import shipped

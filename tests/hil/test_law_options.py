@@ -14,15 +14,16 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.sections import Trajectory
-from jointctl.tools.experiments.controllers import (
+from jointctl.tools.experiments.paper_experiments import ideal, law, r1
+from jointctl.tools.experiments.scenarios import (
     Controller,
+    Scenario,
     changed,
     controller_config,
     controller_constants,
     from_file,
+    run_scenario,
 )
-from jointctl.tools.experiments.paper_experiments import ideal, law, r1
-from jointctl.tools.experiments.scenarios import Scenario, run_scenario
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.configurations import shipped
 

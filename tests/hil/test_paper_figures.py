@@ -18,7 +18,6 @@ from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import StudyResult, StudySettings, quantile, run_study
-from jointctl.tools.experiments.controllers import named
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.experiments.paper_experiments import (
     AFTER_s,
@@ -34,7 +33,7 @@ from jointctl.tools.experiments.paper_experiments import (
     paper_rows,
     window_s,
 )
-from jointctl.tools.experiments.scenarios import ErrorFigures, error_figures, settling_s
+from jointctl.tools.experiments.scenarios import ErrorFigures, error_figures, named, settling_s
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.lockstep import LockstepJoint

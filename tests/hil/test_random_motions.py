@@ -10,19 +10,22 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at, repetition
 from jointctl.tools.experiments.controller_study import EnsembleSettings, checked, random_plant, run_study
-from jointctl.tools.experiments.controllers import Controller, controller_constants, named, with_chosen_gains
 from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.experiments.scenarios import (
     RANDOM_MOTIONS,
     ACCELERATION_radps2,
+    Controller,
     CREEP_radps,
     RandomMotion,
     REACH_rad,
     SPEED_radps,
+    controller_constants,
     error_figures,
+    named,
     random_motion,
     run_scenario,
     settled_share,
+    with_chosen_gains,
 )
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import shipped

@@ -30,9 +30,8 @@ from jointctl.tools.experiments.controller_study import (
     study_figure,
     write_csv,
 )
-from jointctl.tools.experiments.controllers import TABLE, controller_config, named
 from jointctl.tools.experiments.many_runs import Workers
-from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
+from jointctl.tools.experiments.scenarios import FAILED, TABLE, ErrorFigures, controller_config, named
 from jointctl.tools.lockstep import DirectBus
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.study import study, with_plants

@@ -55,25 +55,23 @@ from jointctl.tools.configuration.sections import (
     between,
 )
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
-from jointctl.tools.experiments.controllers import (
+from jointctl.tools.experiments.many_runs import HERE, Workers
+from jointctl.tools.experiments.scenarios import (
     DEFAULT,
+    RANDOM_MOTIONS,
+    RPDO_AT_ONCE,
     Controller,
+    ErrorFigures,
+    Scenario,
     changed,
     controller_config,
     controller_constants,
+    error_figures,
     named,
     one_line,
-    with_chosen_gains,
-)
-from jointctl.tools.experiments.many_runs import HERE, Workers
-from jointctl.tools.experiments.scenarios import (
-    RANDOM_MOTIONS,
-    RPDO_AT_ONCE,
-    ErrorFigures,
-    Scenario,
-    error_figures,
     random_motion,
     run_scenario,
+    with_chosen_gains,
 )
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import replace_file, writing

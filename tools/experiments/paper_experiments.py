@@ -24,8 +24,17 @@ from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config, shipped_control
 from jointctl.tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
-from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, from_file
-from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, Scenario, error_figures, event_s, run_scenario
+from jointctl.tools.experiments.scenarios import (
+    RPDO_AT_ONCE,
+    Controller,
+    Scenario,
+    changed,
+    controller_constants,
+    error_figures,
+    event_s,
+    from_file,
+    run_scenario,
+)
 from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import fit_figure

@@ -88,8 +88,8 @@ def study(
     from jointctl.tools.configuration.load import load_config, shipped_config
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.experiments.controller_study import random_plant, run_study, study_controllers, write_csv
-    from jointctl.tools.experiments.controllers import controller_config
     from jointctl.tools.experiments.many_runs import HERE
+    from jointctl.tools.experiments.scenarios import controller_config
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_target, refuse_overwriting
 

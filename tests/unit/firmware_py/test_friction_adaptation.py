@@ -43,8 +43,15 @@ from jointctl.tools.configuration.config import Adaptation
 from jointctl.tools.configuration.conversions import law_resolution_rad
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
-from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, named
-from jointctl.tools.experiments.scenarios import error_figures, random_motion, run_scenario
+from jointctl.tools.experiments.scenarios import (
+    Controller,
+    changed,
+    controller_constants,
+    error_figures,
+    named,
+    random_motion,
+    run_scenario,
+)
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import shipped, written
 from tests.made_faults import one_fault
