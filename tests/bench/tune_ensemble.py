@@ -1,6 +1,7 @@
 """`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
 
     python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft | --light] [--encoders both]
+                                       [--bits 17 20] [--noise COUNTS] [--bristles]
                                        [--workers 2] [--csv FILE] [--motions] [--cluster tls://HOST:8786]
 
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
@@ -9,7 +10,10 @@ inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no 
 configuration.  Simulated time.  The same law is chosen a second time from the true values, and both run
 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s, and once more until 60 s, when what adapts
 has found its weights.  `--motions`: what was tuned also makes the runs of `flexible_study.py`, with learning and with
-adaptation, motions that never repeat.
+adaptation, motions that never repeat.  `--bits`, `--noise`: of the encoder at the joint.  `--bristles`: no further than
+the step that measures how stiff they are; then motions with that stiffness and with the 8e4 Nm/rad of the shipped
+configurations, errors of the joint itself from 20 to 50 s: up to 16 bit with the Kalman filter of docs/law.md, with
+and without adaptation, above with the gains that are chosen, adaptation and pairing.
 
 Hysteresis leaves a reducer no single stiffness.  The one that is compared is what the virtual reducer did in the
 response itself: its torque over its twist, both of the simulation and by the lines of the excitation, as the analysis
@@ -29,7 +33,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -46,13 +50,23 @@ from jointctl.hil.lockstep import TRUE_POSITION_rad  # noqa: E402
 from jointctl.tools.analysis.gains import choose_gains  # noqa: E402
 from jointctl.tools.analysis.linear_loop import TwoMasses, loop_settings  # noqa: E402
 from jointctl.tools.analysis.margins import margins  # noqa: E402
-from jointctl.tools.configuration.config import Config  # noqa: E402
+from jointctl.tools.configuration.config import Config, Control  # noqa: E402
+from jointctl.tools.configuration.conversions import law_resolution_rad  # noqa: E402
 from jointctl.tools.configuration.found_values import with_values  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
-from jointctl.tools.configuration.sections import Friction, Virtual  # noqa: E402
+from jointctl.tools.configuration.sections import Friction, LuGre, Virtual  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
-from jointctl.tools.experiments.scenarios import Controller  # noqa: E402
+from jointctl.tools.experiments.scenarios import (  # noqa: E402  # noqa: E402
+    RANDOM_MOTIONS,
+    Controller,
+    Scenario,
+    changed,
+    controller_constants,
+    error_figures,
+    random_motion,
+    run_scenario,
+)
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun  # noqa: E402
 from jointctl.tools.output import Output  # noqa: E402
 from jointctl.tools.session.plan import Motion, TerminalConsent  # noqa: E402
@@ -60,9 +74,10 @@ from jointctl.tools.sweeping import carry_out as sweeping  # noqa: E402
 from jointctl.tools.tuning.carry_out import STAGE_PAIRS, Carried, Carrier  # noqa: E402
 from jointctl.tools.tuning.frequency_response import ResponseMotion, ResponsePlan, fourier_sums, median_of  # noqa: E402
 from jointctl.tools.tuning.joint_fit import SMALL_MOTION, Estimate, JointFit, values_of_fit  # noqa: E402
+from jointctl.tools.verbs import tune_steps  # noqa: E402
 from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402
-from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
-from tests.bench.flexible_study import Row, runs_of, table  # noqa: E402
+from jointctl.tools.verbs.tune_steps import STEPS, Tune  # noqa: E402
+from tests.bench.flexible_study import ADAPTATION, Row, runs_of, table  # noqa: E402
 
 RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
@@ -248,12 +263,83 @@ def unloaded(plant: Config, seed: int, index: int) -> Config:
     return plant.changed(joint__inertia_kgm2=inertia, friction=scaled(plant.friction, factor, factor))
 
 
-def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Task:
+    """One joint; it is sent to a process."""
+
+    seed: int
+    index: int
+    kind: str
+    encoders: str
+    motions: bool
+    bits: tuple[int, int]
+    noise_counts: float
+    bristles: bool
+
+
+def bristles_row(kept: dict[str, Any], virtual: Virtual) -> dict[str, Any]:
+    """What was found over what is true; of a joint without bristles the bound alone."""
+    if "why" in kept:
+        return {"not_measured": kept["why"]}
+    if virtual.friction_kind != "lugre":
+        return {"bound_Nmprad": kept["least_Nmprad"], "bound_holds": kept["most_Nmprad"] is None}
+    true = virtual.bristle_stiffness_Nmprad
+    held = kept["least_Nmprad"] <= true <= (kept["most_Nmprad"] or math.inf)
+    written = math.log(kept["stiffness_Nmprad"] / true)
+    row = {"true_Nmprad": true, "bristles_held": held, "bristles_written": written}
+    if kept["found_Nmprad"] is not None:
+        row["bristles"] = math.log(kept["found_Nmprad"] / true)
+    return row
+
+
+KALMAN: dict[int, dict[str, float]] = {  # docs/law.md, coarse encoders; by bits
+    14: {"velocity_cutoff_Hz": 40.0, "observer_radps": 40.0, "kp": 2500.0, "kv": 100.0},
+    15: {"velocity_cutoff_Hz": 50.0, "observer_radps": 50.0, "kp": 3000.0, "kv": 110.0},
+    16: {"velocity_cutoff_Hz": 80.0, "observer_radps": 60.0, "kp": 3600.0, "kv": 120.0},
+}
+SHIPPED = LuGre(stiffness_Nmprad=8e4, damping_Nmspr=200.0)
+MOTIONS_s, MOTIONS_FROM_s = 50.0, 20.0
+COMPARED: tuple[Scenario, ...] = ("reversals", "point_to_point", "multi_sine", "sine")
+
+
+def laws_of(job: Tune) -> dict[str, Control]:
+    """Without learning."""
+    bits = job.config.encoder.counts_per_turn.bit_length() - 1
+    if bits not in KALMAN:
+        return {"tuned": job.chosen_gains("precise", "tracking").control.model_copy(update={"learning": None})}
+    precise = load_config(shipped_config("precise")).control
+    kalman = {**KALMAN[bits], "velocity_filter": "kalman", "feed_forward_lead_s": "auto", "learning": None}
+    laws = {"plain": kalman, "adapting": {**kalman, "adaptation": ADAPTATION}}
+    return {name: changed(precise, changes, name) for name, changes in laws.items()}
+
+
+def compared(job: Tune, task: Task) -> list[tuple[str, Scenario, float, float]]:
+    """(law, motion, RMSE [mrad] with the shipped stiffness, with the measured one); nan where a fault ended it."""
+    friction, joint, rows = job.config.friction, LockstepJoint(job.config), []
+    assert friction is not None
+    for name, control in laws_of(job).items():
+        for scenario in COMPARED:
+            motion = None
+            if scenario in RANDOM_MOTIONS:
+                motion = random_motion(scenario, task.seed, task.index, MOTIONS_s)
+            errors = []
+            for lugre in (SHIPPED, friction.lugre):
+                chosen = Controller(name, control, friction.model_copy(update={"lugre": lugre}))
+                constants = controller_constants(job.config, chosen, joint.report.start_position_rad)
+                run = run_scenario(joint, constants, scenario, motion=motion)
+                figures = error_figures(run, MOTIONS_FROM_s, motion, law_resolution_rad(job.config))
+                errors.append(math.nan if figures.fault else figures.true_rmse_mrad)
+            rows.append((name, scenario, errors[0], errors[1]))
+    return rows
+
+
+def tuned(task: Task) -> dict[str, Any]:
     """One joint; with `failed` where it was not tuned."""
-    seed, index, kind, encoders, motions = task
+    seed, index, kind, encoders = task.seed, task.index, task.kind, task.encoders
     soft = kind == "soft"
     base = load_config(shipped_config("realistic" if soft else "precise"))
-    plant = random_plant(base, EnsembleSettings(flexible=soft, law=LAWS[encoders]), seed, index)
+    settings = EnsembleSettings(flexible=soft, law=LAWS[encoders], encoder_bits=task.bits)
+    plant = random_plant(base, settings, seed, index).changed(virtual__encoder_noise_counts=task.noise_counts)
     if kind == "light":
         plant = unloaded(plant, seed, index)
     if encoders == "motor":
@@ -267,10 +353,14 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     try:
         with tempfile.TemporaryDirectory() as folder:
             job = Tune(guess, TuneOptions(lockstep=True), carrier, Path(folder))
-            with patch.object(sweeping, "sweep_in_lockstep", carrier.sweep):
+            steps = STEPS[: STEPS.index("bristles") + 1] if task.bristles else STEPS
+            with patch.object(sweeping, "sweep_in_lockstep", carrier.sweep), patch.object(tune_steps, "STEPS", steps):
                 job.carry_out()
     except JointctlError as error:
         return {**row, "failed": error.message}
+    row |= bristles_row(job.state["bristles"], plant.virtual)
+    if task.bristles:
+        return {**row, "compared": [] if "not_measured" in row else compared(job, task)}
     whole_s = time.process_time() - started
     row |= {"cpu_s": whole_s, "computing_s": whole_s - carrier.simulation_s}
     row |= {"joint_s": carrier.seconds + job.state["friction"]["seconds"]}
@@ -310,10 +400,15 @@ def tuned(task: tuple[int, int, str, str, bool]) -> dict[str, Any]:
     known = with_values(job.config, values_of_fit(job.config, truth, ""))
     assert plant.friction is not None
     friction = scaled(plant.friction, virtual.friction_positive_scale, virtual.friction_negative_scale)
+    assert job.config.friction is not None
+    lugre = job.config.friction.lugre
+    if lugre is not None and "true_Nmprad" in row:
+        lugre = lugre.model_copy(update={"stiffness_Nmprad": row["true_Nmprad"]})
+    friction = friction.model_copy(update={"lugre": lugre})
     known = known.changed(friction=friction)
     best = choose_gains(known, truth.intervals(), row["law"])
     row["rmse_true_mrad"], row["late_rmse_true_mrad"] = rmse_mrad(known.changed(control=best.control))
-    if motions:
+    if task.motions:
         control = job.config.control.model_copy(update={"learning": None, "adaptation": None})
         chosen = Controller("tuned", control, job.config.friction)
         row["motions"] = [
@@ -331,6 +426,38 @@ def _figures(rows: list[dict[str, Any]], name: str) -> str:
     return f"median {np.median(values):.4g}, worst {np.max(values):.4g} of {len(values)}"
 
 
+def _bristles(rows: list[dict[str, Any]]) -> None:
+    """Stiffness found over the true one, as a factor either way, and whether the interval holds it."""
+    some = [row for row in rows if "true_Nmprad" in row]
+    print(f"  bristles: interval holds {sum(row['bristles_held'] for row in some)} of {len(some)}")
+    for name in ("bristles", "bristles_written"):
+        factors = np.exp(np.abs([row[name] for row in some if name in row]))
+        if len(factors):
+            print(f"    {name}: factor median {np.median(factors):.3f}, worst {np.max(factors):.3f} of {len(factors)}")
+    bounds = [row["bound_Nmprad"] for row in rows if "bound_Nmprad" in row]
+    if bounds:
+        held = sum(row.get("bound_holds", False) for row in rows)
+        print(f"    rigid contact: bound {min(bounds):.3g} .. {max(bounds):.3g}, no end for {held} of {len(bounds)}")
+    print(f"    not measured: {sum('not_measured' in row for row in rows)}")
+
+
+def _compared(rows: list[dict[str, Any]]) -> None:
+    """Medians and worst of both stiffnesses, and of their quotient."""
+    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for row in rows:
+        for law, scenario, shipped, measured in row["compared"]:
+            found.setdefault((law, row["friction"], scenario), []).append((shipped, measured))
+    for names, pairs in sorted(found.items()):
+        values = np.array(pairs)
+        both = np.isfinite(values).all(axis=1)
+        median, worst = np.median(values[both], axis=0), np.max(values[both], axis=0)
+        ratio, faults = values[both, 1] / values[both, 0], np.isnan(values).sum(axis=0)
+        print(
+            f"  {' '.join(names)}: {median[0]:.4f} / {worst[0]:.4f} -> {median[1]:.4f} / {worst[1]:.4f} mrad, quotient "
+            f"{np.median(ratio):.3f} / {np.max(ratio):.3f} of {both.sum()}, faults {faults[0]} -> {faults[1]}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=90701)
@@ -340,11 +467,19 @@ def main() -> None:
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, default="rigid")
     parser.add_argument("--encoders", choices=tuple(LAWS), default="both", help="of a soft joint; default: both")
     parser.add_argument("--motions", action="store_true")
+    parser.add_argument("--bits", type=int, nargs=2, default=(17, 20), help="of the encoder at the joint")
+    parser.add_argument("--noise", type=float, default=0.0, help="of the encoder, counts")
+    parser.add_argument("--bristles", action="store_true", help="the steps up to that alone")
     parser.add_argument("--workers", type=int, help="processes; default: one a core")
     parser.add_argument("--cluster", help="address of a dask scheduler: docs/cluster.md")
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
-    tasks = [(given.seed, index, given.kind, given.encoders, given.motions) for index in range(given.plants)]
+    tasks = [
+        Task(
+            given.seed, index, given.kind, given.encoders, given.motions, tuple(given.bits), given.noise, given.bristles
+        )
+        for index in range(given.plants)
+    ]
     rows: list[dict[str, Any]] = []
     for row in Workers(given.workers, given.cluster).results(tuned, tasks):
         rows.append(row)
@@ -352,6 +487,11 @@ def main() -> None:
     rows.sort(key=lambda row: int(row["plant"]))
     moved = [one for row in rows for one in row.pop("motions", ())]
     good = [row for row in rows if "failed" not in row]
+    if given.bristles:
+        print(f"{len(good)} of {len(rows)} measured, seed {given.seed}, {given.kind}, {given.bits} bit; simulated")
+        _bristles(good)
+        _compared(good)
+        return
     for row in good:
         row["ratio"] = row["rmse_mrad"] / row["rmse_true_mrad"]
         row["late_ratio"] = row["late_rmse_mrad"] / row["late_rmse_true_mrad"]
@@ -365,6 +505,7 @@ def main() -> None:
                  "rmse_true_mrad", "ratio", "late_rmse_mrad", "late_rmse_true_mrad", "late_ratio", "joint_s",
                  "computing_s", "cpu_s"):  # fmt: skip
         print(f"  {name}: {_figures(good, name)}")
+    _bristles(good)
     margins_deg = sorted(row["true_margin_deg"] for row in good)
     print(f"  true phase margin: worst {margins_deg[0]:.1f}, 30 deg and more {sum(m >= 30.0 for m in margins_deg)}")
     for name in ("ratio", "late_ratio"):

@@ -41,6 +41,7 @@ from jointctl.tools.verbs import tune_steps
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
+from jointctl.tools.verbs.tune_report import envelope
 from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import written
@@ -134,6 +135,10 @@ def test_a_tune_finds_the_joint_and_writes_what_is_better(tuned: Tuned) -> None:
     assert after.margin.loop_delay_s is not None
     assert after.margin.loop_delay_s + after.margin.current_lag_s == pytest.approx(1.5e-3, abs=0.1e-3)
     assert after.friction.positive.tc_Nm == pytest.approx(1.1 * 0.11985, rel=0.03)
+    lugre = after.friction.lugre
+    assert lugre.stiffness_Nmprad == pytest.approx(8e4, rel=0.2)
+    assert lugre.damping_Nmspr == pytest.approx(200.0, rel=0.2)
+    assert f"# tuned by jointctl: stiffness_Nmprad = {lugre.stiffness_Nmprad:g}; " in text
     assert plant_settings(after)["inertia_kgm2"] == pytest.approx(plant_settings(before)["inertia_kgm2"], rel=1e-4)
     true = after.changed(joint__inertia_kgm2=2.1, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
     assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
@@ -447,6 +452,52 @@ def test_a_tune_goes_on_where_it_ended(tuned: Tuned, tmp_path: Path) -> None:
     assert load_config(path).control.kv not in (kv, tuned.before.control.kv)
 
 
+def test_a_tune_of_before_the_bristles_measures_them_and_chooses_its_gains_again(tuned: Tuned, tmp_path: Path) -> None:
+    """A folder of an older version is gone on with from the step that it lacks, also where the tune was finished."""
+    path = tuned.ended_before_its_gains(tmp_path)
+    shutil.copy(tuned.path.with_suffix(".tune") / "steps.json", path.with_suffix(".tune") / "steps.json")
+    change_steps(path, lambda state: state.pop("bristles"))
+    output, out, err = outputs()
+    assert tune(load_config(path), output, options=TuneOptions(lockstep=True, resume=True)) == 0
+    said = err.getvalue()
+    assert "friction: done before" in said
+    assert not any(f"{name}: done before" in said for name in ("bristles", "gains", "verification"))
+    assert json.loads(out.getvalue())["bristles"]["found_Nmprad"] == pytest.approx(8e4, rel=0.2)
+
+
+def test_the_bristles_of_a_stick_slip_joint_are_a_bound(tmp_path: Path) -> None:
+    """No stiffer than what bends by a quarter of a count; a file without the section gets one."""
+    friction = load_config(shipped_config("precise")).friction.model_dump(exclude={"lugre"}, exclude_none=True)
+    path = written(
+        tmp_path / "joint.toml", "precise", virtual__friction_kind="stick_slip", encoder__counts_per_turn=2**17,
+        friction=friction, control__feed_forward="desired",
+    )  # fmt: skip
+    config = load_config(path)
+    job = Tune(
+        config,
+        TuneOptions(lockstep=True),
+        Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None),
+        tmp_path,
+    )
+    job.fit = Mock(flexible=False)
+    kept = job._step_bristles()
+    assert (kept["found_Nmprad"], kept["most_Nmprad"]) == (None, None)
+    assert 1e6 < kept["stiffness_Nmprad"] <= kept["least_Nmprad"]
+    job._take_bristles(kept)
+    assert job.config.friction is not None
+    assert job.config.friction.lugre is not None
+    assert job.config.friction.lugre.stiffness_Nmprad == kept["stiffness_Nmprad"]
+
+
+def test_the_bristles_of_a_soft_joint_are_left_alone(tmp_path: Path) -> None:
+    config = load_config(shipped_config("realistic"))
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)
+    job.fit = Mock(flexible=True)
+    job._take_bristles(job._step_bristles())
+    assert job.config == config
+
+
 def test_gains_that_measure_better_bring_their_own_margins(
     tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -510,7 +561,7 @@ def test_it_is_verified_from_wherever_the_joint_stands(
             trajectory__frequency_Hz=frequency_Hz, sequence__approach_s=0.0, virtual__initial_position_rad=start_rad,
         )  # fmt: skip
         job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)
-        assert f"verify     {kind} " in "\n".join(job.envelope())
+        assert f"verify     {kind} " in "\n".join(envelope(job))
         assert job._verified(config, title)["peak_mrad"] < 5.0
 
 

@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -112,6 +113,29 @@ def test_a_fault_in_a_step_ends_it_in_one_line(tmp_path: Path, kind: str, at_s: 
         assert len((path.with_suffix(".tune") / "friction.csv").read_text().splitlines()) > 3
 
 
+@pytest.mark.parametrize(
+    ("kind", "fault"),
+    [("encoder_stuck", "POSITION_FROZEN"), ("current_loop_dead", "POSITION_FROZEN"), ("frames_lost", "STALE_SAMPLE")],
+)
+def test_a_fault_while_the_joint_stands_ends_it_and_keeps_the_steps_before(
+    tmp_path: Path, kind: str, fault: str
+) -> None:
+    """A reading that stands under less torque than moves the joint is none: the twin is every tune."""
+    path = written(tmp_path / "joint.toml", "precise")
+    text = with_fault(path, kind, 30.0)
+    carrier, folder = watched(), path.with_suffix(".tune")
+    job = Tune(load_config(path), TuneOptions(lockstep=True), carrier, folder)
+    job._open()
+    job.state = {"direction": [], "response": {}, "gravity": {}, "friction": {}}
+    job._save()
+    job.fit = Mock(flexible=False)
+    with pytest.raises(MotionFault, match=f"bristles: {fault}"):
+        job._step_bristles()
+    assert carrier.drive_state in OFF
+    assert path.read_text() == text
+    assert "friction" in json.loads((folder / "steps.json").read_text())
+
+
 @pytest.mark.parametrize("title", ["the same before", "refinement", "verification"])
 @pytest.mark.parametrize("fault", [Fault.LIMIT_CYCLE, Fault.VELOCITY_LIMIT, Fault.POSITION_JUMP, Fault.STALE_SAMPLE])
 def test_only_a_fault_of_the_gains_lets_a_tune_go_on_to_its_next_motion(
@@ -168,7 +192,7 @@ def test_a_joint_that_stands_under_enough_torque_is_not_tried_again(tmp_path: Pa
     assert carrier.motions == 2
 
 
-@pytest.mark.parametrize(("since", "steps"), [(6, 5), (8, 6)])
+@pytest.mark.parametrize(("since", "steps"), [(7, 6), (9, 7)])
 def test_a_payload_between_the_steps_is_seen_before_gains_and_after_the_verification(
     tmp_path: Path, since: int, steps: int
 ) -> None:

@@ -269,7 +269,7 @@ def placed_sweep(config: Config, joint: LockstepJoint, strokes: SweepStrokes, st
 
 # --- a step of a tune ---
 
-STEPS_THAT_MOVE = ("direction", "response", "friction", "verification")
+STEPS_THAT_MOVE = ("direction", "response", "friction", "verification", "bristles")
 
 
 @dataclass(frozen=True)
@@ -286,9 +286,14 @@ PlaceStep = Callable[[Config, LockstepJoint, TuneStep, float], PlacedSweep]
 
 
 def draw_step(random: np.random.Generator) -> TuneStep | None:
-    """None: a trajectory, as a verification runs one."""
-    name = STEPS_THAT_MOVE[int(random.integers(len(STEPS_THAT_MOVE)))]
+    """None: a trajectory, as a verification runs one.
+
+    The bristles take half of what were directions: the other scenarios of a seed stay what they were.
+    """
+    name = STEPS_THAT_MOVE[int(random.integers(len(STEPS_THAT_MOVE) - 1))]
     share, strokes = float(random.uniform(0.125, 1.0)), draw_strokes(random)
+    if name == "direction" and share > 0.5625:
+        name = "bristles"
     return None if name == "verification" else TuneStep(name, share, strokes)
 
 

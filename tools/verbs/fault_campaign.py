@@ -168,6 +168,7 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
     from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan
     from jointctl.tools.tuning.carry_out import LEAST_LEGS, response_task
     from jointctl.tools.tuning.frequency_response import SPEED_radps, motor_fed
+    from jointctl.tools.tuning.presliding import presliding_motion
 
     # what the step of the direction finds, on this joint
     static_Nm = static_friction_Nm(config) or 0.0
@@ -180,7 +181,10 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
             sliding = config.joint.reduction_ratio * friction_curve_Nm(curve, at_radps)
             unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0, SPEED_radps)
         return placed_sweep(unknown, joint, step.strokes, start_rad)
-    if step.name == "direction":
+    pushed = presliding_motion(config) if step.name == "bristles" and config.reducer is None else None
+    if pushed is not None:
+        motion = pushed
+    elif step.name in ("direction", "bristles"):
         moving = motor_fed(config)
         plan = make_plan(moving, None)
         motion = CheckMotion(config_of_check(moving, plan), plan)

@@ -51,16 +51,17 @@ def tune(
     assume_yes: Yes = False,
     dry_run: DryRun = False,
 ) -> int:
-    """Identify the joint and choose its gains: about 7 minutes of motion; writes CONFIG and a report, asks once.
+    """Identify the joint and choose its gains: about 9 minutes of motion; writes CONFIG and a report, asks once.
 
-    Direction, frequency response, gravity, friction, map of the reducer, gains, a run to verify them.  An aborted tune
-    leaves the file as it was.
+    Direction, frequency response, gravity, friction and its bristles, map of the reducer, gains, a run to verify them.
+    An aborted tune leaves the file as it was.
     """
     from jointctl.tools.configuration.config import refuse_shipped
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import require_terminal
     from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, ShownConsent
+    from jointctl.tools.verbs.tune_report import envelope
     from jointctl.tools.verbs.tune_steps import Tune
 
     for name, value, known in (("--law", options.law, LAWS), ("--objective", options.objective, OBJECTIVES)):
@@ -76,7 +77,7 @@ def tune(
         if not options.lockstep:
             carrier.control = stack.enter_context(in_control(job.config, output))
         try:
-            consent.show(job.envelope())
+            consent.show(envelope(job))
             if not (dry_run or consent.agreed(())):
                 return never_begun("", output)
             if carrier.control is not None:

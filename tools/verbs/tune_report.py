@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, text_Nm
 from jointctl.tools.analysis.gains import ChosenGains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
@@ -17,15 +17,45 @@ from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
+from jointctl.tools.tuning.carry_out import VERIFY_s, response_task
 from jointctl.tools.tuning.frequency_response import bode_figure
-from jointctl.tools.verbs.response import fit_table
+from jointctl.tools.tuning.presliding import bristle_values, bristles_text
+from jointctl.tools.verbs.map import speeds_in_turn
+from jointctl.tools.verbs.response import AS_IT_FITS, fit_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jointctl.tools.verbs.tune_steps import Tune
 
+SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz", "link_cutoff_Hz")  # that are shown
+
+
+def envelope(job: Tune) -> list[str]:
+    """Every motion, in its order."""
+    limits, output = job.config.limits, job.config.path
+    low, high = limits.position_min_rad, limits.position_max_rad
+    task = response_task(job.config, None, AS_IT_FITS.legs)
+    top_radps = SWEEP_SHARE * limits.velocity_max_radps
+    inside, slowly = f"{low:+.3f} .. {high:+.3f} rad", speeds_in_turn(job.config)
+    verified = f"{job.verifying.kind} of the configuration"
+    if job.verifying.kind != job.config.trajectory.kind:
+        verified = f"{job.verifying.kind} over the range of the configured motion, whose approach may swing far"
+    return [
+        f"tune       {output}, law {job.options.law}, objective {job.options.objective}",
+        "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
+        f"response   triangle at 0.2 rad/s within {inside}, multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
+        f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
+        "bristles   a soft spring pushes the joint to and fro while it stands, at places within 0.2 rad, about a "
+        "minute, where the joint is rigid",
+        f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft"
+        + (f"; at up to {slowly[-1]:g} where it swings" if slowly[1:] else ""),
+        f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
+        "and after it half a minute of the response, for a joint that has changed",
+        f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)} in every "
+        "step; keep the joint free and unloaded, a hand on the emergency stop",
+    ]
 
 
 def values_of(job: Tune) -> list[Found]:
@@ -56,6 +86,7 @@ def values_of(job: Tune) -> list[Found]:
             values += [Found(("friction", key), name, number, "") for name, number in value.items()]
         else:
             values.append(Found(("friction",), key, value, ""))
+    values += bristle_values(job.state["bristles"])
     values += [Found(("reducer", "map"), key, value, "") for key, value in job.state["map"].items()]
     second, chosen = job.original.joint_encoder, job.config.joint_encoder
     if second is not None and chosen is not None and second.law != chosen.law:
@@ -127,7 +158,7 @@ def write_report(job: Tune, values: list[list[Any]]) -> None:
     ]
     if job.found_map is not None:
         pictures.append(svg_figure(map_figure(job.found_map, "Map of the reducer"), "Kinematic error and ripple"))
-    moved = [line.split(maxsplit=1) for line in job.envelope()]
+    moved = [line.split(maxsplit=1) for line in envelope(job)]
     sections = [
         Section("Moved", [PageTable(["step", "motion"], moved)]),
         Section("Found", [from_terminal(fitted), *_other_findings(job)]),
@@ -142,6 +173,7 @@ def _other_findings(job: Tune) -> list[Paragraph]:
         f"Friction: {friction['points']} plateaus in friction.csv, the curve misses them by "
         f"{1e3 * friction['rmse_Nm']:.3g} mNm (RMSE) at the motor."
     ]
+    lines.append(f"Bristles: {bristles_text(job.state['bristles'])}.")
     if gravity["found"]:
         lines.append(f"Gravity: {gravity['torque_Nm']:.3g} +- {gravity['half_Nm']:.2g} Nm.")
     if job.state["map"]:

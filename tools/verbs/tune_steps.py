@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ from jointctl.tools.configuration.found_values import (
 )
 from jointctl.tools.configuration.load import load_config, read_text
 from jointctl.tools.configuration.records import trajectory_table
-from jointctl.tools.configuration.sections import ReducerMap, Trajectory
+from jointctl.tools.configuration.sections import LuGre, ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
@@ -66,7 +67,6 @@ from jointctl.tools.tuning.carry_out import (
     Carrier,
     NotCarriedOut,
     TooWeak,
-    VERIFY_s,
     require_one_joint,
     require_same_joint,
     response_by_any_law,
@@ -84,14 +84,15 @@ from jointctl.tools.tuning.frequency_response import (
     with_torque_limit,
 )
 from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_of, gravity_of, values_of_fit
+from jointctl.tools.tuning.presliding import bristle_values, bristles_text, measured_bristles
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
-from jointctl.tools.verbs.tune_report import values_of, write_report
+from jointctl.tools.verbs.tune_report import SWEEP_SHARE, values_of, write_report
 from jointctl.tools.written_file import prepare_folder, replace_file
 
-STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
+STEPS = ("direction", "response", "gravity", "friction", "bristles", "map", "gains", "verification")
 STATE, ANEW = "steps.json", "without --resume it begins anew"
 OTHER = "of another drive, or of a simulated joint instead of a real one"
 FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
@@ -100,7 +101,6 @@ MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.POSITION_LIMIT, *OF_GAINS[1:])
 SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
           "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
-SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
 SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the next where the slow ones swing
 SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
@@ -136,31 +136,6 @@ class Tune:
         self.config = with_torque_limit(self.original, self.options.torque_Nm)
         response_task(self.config, None, AS_IT_FITS.legs)  # what does not fit is refused before anything moves
         self.verifying = verifying_motion(self.config)
-
-    # --- what it will do ---
-
-    def envelope(self) -> list[str]:
-        """Every motion, in its order."""
-        limits, output = self.config.limits, self.config.path
-        low, high = limits.position_min_rad, limits.position_max_rad
-        task = response_task(self.config, None, AS_IT_FITS.legs)
-        top_radps = SWEEP_SHARE * limits.velocity_max_radps
-        inside, slowly = f"{low:+.3f} .. {high:+.3f} rad", speeds_in_turn(self.config)
-        verified = f"{self.verifying.kind} of the configuration"
-        if self.verifying.kind != self.config.trajectory.kind:
-            verified = f"{self.verifying.kind} over the range of the configured motion, whose approach may swing far"
-        return [
-            f"tune       {output}, law {self.options.law}, objective {self.options.objective}",
-            "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
-            f"response   triangle at 0.2 rad/s within {inside}, multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
-            f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
-            f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft"
-            + (f"; at up to {slowly[-1]:g} where it swings" if slowly[1:] else ""),
-            f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
-            "and after it half a minute of the response, for a joint that has changed",
-            f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)} in every "
-            "step; keep the joint free and unloaded, a hand on the emergency stop",
-        ]
 
     # --- the chain ---
 
@@ -209,7 +184,9 @@ class Tune:
             if about not in (own, {**own, "configuration": kept.get("written")}):
                 raise DataError(f"{path}: is of another configuration or torque than {original.path}, {OTHER}", ANEW)
             steps = STEPS if kept.get("asked") == asked else STEPS[: STEPS.index("gains")]  # another law or objective
-            self.state = {name: kept[name] for name in steps if name in kept}
+            self.state = {
+                name: kept[name] for name in takewhile(kept.__contains__, steps)
+            }  # one that is missing is made
         elif not self.carrier.consent.dry_run:
             path.unlink(missing_ok=True)  # a later --resume must not go on with an older tune's steps
         self._about = {"about": about, "asked": asked}
@@ -422,7 +399,21 @@ class Tune:
         self.carrier.output.note(f"  {kept['points']} plateaus, RMSE {1e3 * kept['rmse_Nm']:.3g} mNm at the motor")
         self.config = with_friction(self.config, kept["section"])
 
-    # --- 5. map of the reducer ---
+    # --- 5. bristles of the friction ---
+
+    def _step_bristles(self) -> dict[str, Any]:
+        """Of a rigid joint: one whose reducer is soft twists by more."""
+        assert self.fit is not None
+        if self.fit.flexible or self.config.reducer is not None:
+            return {"why": "the reducer is soft, and twists by more than they bend"}
+        return measured_bristles(self.config, self.carrier)
+
+    def _take_bristles(self, kept: dict[str, Any]) -> None:
+        self.carrier.output.note(f"  {bristles_text(kept)}")
+        if values := bristle_values(kept):
+            self.config = self.config.changed(friction__lugre=LuGre(**{one.key: one.value for one in values}))
+
+    # --- 6. map of the reducer ---
 
     def _step_map(self) -> dict[str, Any]:
         """Of a joint with two encoders and a soft reducer; nothing else has a use for it."""
@@ -450,7 +441,7 @@ class Tune:
             values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in kept.items()}
             self.config = self.config.changed(reducer__map=ReducerMap(**values))
 
-    # --- 6. gains ---
+    # --- 7. gains ---
 
     def _step_gains(self) -> dict[str, Any]:
         self._require_same_joint("before the gains")  # a law that is chosen for another joint may swing
@@ -495,7 +486,7 @@ class Tune:
         for name in kept["missed"]:
             self.carrier.output.warning(f"this joint does not allow all: {name}")
 
-    # --- 7. the run that shows it ---
+    # --- 8. the run that shows it ---
 
     def _step_verification(self) -> dict[str, Any]:
         found = {"after": self._verified(self.config, "verification")}
@@ -544,7 +535,7 @@ class Tune:
             "seconds": self.verifying.duration_s,
         }  # fmt: skip
 
-    # --- 8. refinement ---
+    # --- 9. refinement ---
 
     def _refine(self) -> None:
         """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
@@ -569,7 +560,7 @@ class Tune:
         self.state["refinement"] = {"runs": runs}
         self._save()
 
-    # --- 9. what is written ---
+    # --- 10. what is written ---
 
     def _write(self) -> None:
         values, path, text = values_of(self), self.original.path, self.original.text
