@@ -321,7 +321,8 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        break_away_Nm=float(np.abs(pushed[: first + 1 or None]).max()),
+        # a count of a coarse encoder is a kick of many Nm, too short to move anything
+        break_away_Nm=float(np.abs(_smoothed(pushed[: first + 1 or None])).max()),
         torque_max_Nm=float(np.abs(torque).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,

@@ -132,6 +132,15 @@ def test_bristles_that_give_way_are_not_taken_for_breaking_away(tmp_path: Path, 
     assert 0.95 * 19.0575 < findings["friction"].numbers["break_away_Nm"] < 1.25 * 19.0575
 
 
+@pytest.mark.parametrize("bits", [14, 15, 16])
+def test_the_kicks_of_a_coarse_encoder_are_not_taken_for_what_moves_the_joint(bits: int) -> None:
+    """Each count is some Nm for a few milliseconds; with them `tune` took the joint for a light one."""
+    config = shipped("precise").changed(encoder__counts_per_turn=1 << bits, virtual__encoder_noise_counts=0.3)
+    findings, _, fault = checked(config)
+    assert fault is Fault.NONE
+    assert 0.95 * 19.0575 < findings["friction"].numbers["break_away_Nm"] < 1.25 * 19.0575
+
+
 @pytest.mark.parametrize("gravity_Nm", [-12.0, 0.0, 12.0])
 def test_the_torque_to_break_away_is_that_beside_gravity(tmp_path: Path, gravity_Nm: float) -> None:
     """A pull down takes less torque than friction, a pull up takes more."""
