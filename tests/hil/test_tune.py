@@ -44,6 +44,7 @@ from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_report import envelope
 from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
 from jointctl.tools.virtual_joint import plant_settings
+from tests.bench.tune_ensemble import scaled
 from tests.configurations import written
 from tests.page_figures import foreign_colours, svgs
 
@@ -563,6 +564,19 @@ def test_it_is_verified_from_wherever_the_joint_stands(
         job = Tune(config, TuneOptions(lockstep=True), carrier, tmp_path)
         assert f"verify     {kind} " in "\n".join(envelope(job))
         assert job._verified(config, title)["peak_mrad"] < 5.0
+
+
+def test_the_old_gains_are_compared_though_the_friction_of_the_file_was_half_of_what_was_found(tmp_path: Path) -> None:
+    """The reading may stand under the true friction: with that of the file it was called frozen, at the very end."""
+    output, *_ = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    found = load_config(shipped_config("precise"))
+    before = found.changed(friction=scaled(found.friction, 0.5, 0.5), virtual__friction=found.friction)
+    job = Tune(before, TuneOptions(lockstep=True), carrier, tmp_path)
+    with pytest.raises(MotionFault, match="POSITION_FROZEN"):
+        job._verified(before, "the same before")
+    job.config = before.changed(friction=found.friction)
+    assert job._verified(before, "the same before")["peak_mrad"] < 1.0
 
 
 @pytest.mark.parametrize("plan", ["same", "another"])

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import (
     ConfigurationError,
     DataError,
@@ -48,7 +49,7 @@ from jointctl.tools.configuration.found_values import (
     without_friction,
 )
 from jointctl.tools.configuration.load import load_config, read_text
-from jointctl.tools.configuration.records import trajectory_table
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.configuration.sections import LuGre, ReducerMap, Trajectory
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
@@ -56,7 +57,7 @@ from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
-from jointctl.tools.session.plan import ConfiguredMotion
+from jointctl.tools.session.plan import ConfiguredMotion, Placed
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
@@ -110,6 +111,20 @@ WORSE = 1.5  # times the error with the gains as they were
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
 REFINE_APART = 0.15  # share by which gains that are tried must differ
+
+
+@dataclass(frozen=True)
+class VerifyingMotion(ConfiguredMotion):
+    """Its reading is watched with the friction that was found: that of the file as it was may be far too small."""
+
+    found: Config
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        placed = super().placed(report)
+        known = axis_constants(self.found, self.table, start_position_rad=report.start_position_rad)[0].limits
+        limits = placed.constants[0].limits
+        limits.frozen_torque_Nm, limits.frozen_cycles = known.frozen_torque_Nm, known.frozen_cycles
+        return placed
 
 
 @dataclass
@@ -501,7 +516,8 @@ class Tune:
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
         rmse = {when: kept[when]["rmse_mrad"] for when in ("before", "after") if "rmse_mrad" in kept.get(when, {})}
-        self.carrier.output.note(f"  RMSE {', '.join(f'{when} {one:.4f} mrad' for when, one in rmse.items())}")
+        ended = f"; the file as it was: {kept['before']['fault']}" if "fault" in kept.get("before", {}) else ""
+        self.carrier.output.note(f"  RMSE {', '.join(f'{when} {one:.4f} mrad' for when, one in rmse.items())}{ended}")
         if rmse.get("after", 0.0) > WORSE * rmse.get("before", math.inf):
             self.carrier.output.warning(f"the old gains track better; {self.folder / 'before.toml'} has them")
 
@@ -522,7 +538,7 @@ class Tune:
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
         moving = with_motion(config, self.verifying)
-        motion = ConfiguredMotion(moving, trajectory_table(moving))
+        motion = VerifyingMotion(moving, trajectory_table(moving), self.config)
         carried = self.carrier.run(moving, motion, title, also_faults=() if title == "verification" else OF_GAINS)
         rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
         rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * self.verifying.duration_s)]
