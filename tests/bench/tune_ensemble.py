@@ -57,7 +57,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config  # noq
 from jointctl.tools.configuration.sections import Friction, LuGre, Virtual  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
-from jointctl.tools.experiments.scenarios import (  # noqa: E402  # noqa: E402
+from jointctl.tools.experiments.scenarios import (  # noqa: E402
     RANDOM_MOTIONS,
     Controller,
     Scenario,
