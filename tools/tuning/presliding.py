@@ -178,6 +178,7 @@ MODEL_SHARE = 0.15  # by which the stiffness may be wrong besides
 EDGE_SHARE = 0.15  # and where a count without noise is more than the bend: the spring's torque jumps at its edge
 NOISE_THAT_HELPS = 0.1  # counts
 LEAST_STRETCHES = 10
+SLIPPED = 1.0  # counts, of what the model misses
 _TABLE = 2048  # of a count
 
 
@@ -273,7 +274,7 @@ def _likelihoods(stretches: list[Stretch], counts_pNm: Array, noise_counts: floa
 def fit_bristles(
     stretches: list[Stretch], static_Nm: float, resolution_rad: float, noise_counts: float
 ) -> Bristles | None:
-    """None where the joint stood too seldom."""
+    """None where the joint stood too seldom, or slipped by more than its most likely bristles bend."""
     if len(stretches) < LEAST_STRETCHES:
         return None
 
@@ -286,6 +287,10 @@ def fit_bristles(
     _, low, high = likely(COARSE)
     bends = np.linspace(COARSE[max(low - 1, 0)], COARSE[min(high + 1, len(COARSE) - 1)], FINE)
     best, low, high = likely(bends)
+    compliance = float(bends[best]) / (static_Nm * resolution_rad)
+    missed = np.mean([np.min(one) for one in _missed(stretches, compliance, noise_counts)])
+    if missed > max(SLIPPED**2, np.mean([np.var(compliance * one.bend) for one in stretches])):
+        return None
     quiet = max(1.0 - noise_counts / NOISE_THAT_HELPS, 0.0)
     wider = 1.0 + MODEL_SHARE + EDGE_SHARE * quiet * resolution_rad / max(bends[best], 0.2 * resolution_rad)
     least, most = (float(static_Nm / bends[k]) if bends[k] > 0.0 else math.inf for k in (high, low))
@@ -339,7 +344,7 @@ def measured_bristles(config: Config, carrier: Carrier) -> dict[str, Any]:
     frictions_Nm = static_frictions_Nm(config, config.friction)
     found = bristles_of(motion, records, frictions_Nm)
     if found is None:
-        return {"why": f"the joint stood less than {LEAST_STRETCHES} times"}
+        return {"why": f"the joint stood less than {LEAST_STRETCHES} times, or slipped"}
     seen = math.isfinite(found.stiffness_Nmprad)
     finest_Nmprad = 0.5 * sum(frictions_Nm) / (QUARTER * law_resolution_rad(config))
     stiffness_Nmprad = min(found.stiffness_Nmprad if seen else found.least_Nmprad, finest_Nmprad)

@@ -58,16 +58,18 @@ def way_rad(torque_Nm: np.ndarray, stiffness_Nmprad: float, friction_Nm: tuple[f
 
 def measured(
     stiffness_Nmprad: float, friction_Nm: tuple[float, float], resolution_rad: float, noise: float, seed: int,
-    places: int = 30,
+    places: int = 30, slip_rad: float = 0.0,
 ) -> Bristles | None:  # fmt: skip
-    """The fit of that many places with an encoder like that; infinitely stiff: nothing moves."""
+    """The fit of that many places with an encoder like that; infinitely stiff: nothing moves; a slip in every third."""
     random, found, variances = np.random.default_rng(seed), [], []
     static_Nm = 0.5 * sum(friction_Nm)
-    for _ in range(places):
+    for place in range(places):
         torque = triangle_Nm(random.uniform(0.4, 0.7) * min(friction_Nm), AMPLITUDE * min(friction_Nm))
         way = np.zeros_like(torque)
         if math.isfinite(stiffness_Nmprad):
             way = way_rad(torque, stiffness_Nmprad, friction_Nm)
+        if place % 3 == 0:
+            way[len(way) // 2 :] += slip_rad
         read = way / resolution_rad + random.uniform(-50.0, 50.0) + noise * random.standard_normal(len(torque))
         stretches, variance = stretches_of(torque, np.round(read), friction_Nm, PERIOD_s)
         found += stretches
@@ -105,6 +107,15 @@ def test_of_a_rigid_contact_a_bound_is_known(bits: int, noise: float, seed: int)
     assert found is not None
     assert (found.stiffness_Nmprad, found.most_Nmprad) == (math.inf, math.inf)
     assert found.least_Nmprad > 18.0 / (0.2 * resolution_rad)
+
+
+@pytest.mark.parametrize("stiffness_Nmprad", [math.inf, 8e4])
+@pytest.mark.parametrize("bits", [14, 17, 20])
+def test_a_joint_that_slips_has_no_bristles_as_soft_as_that(bits: int, stiffness_Nmprad: float) -> None:
+    """A light joint that sticks and slips is dragged on by the spring; 8e4 Nm/rad bend by 0.2 mrad."""
+    friction_Nm, resolution_rad = (17.0, 16.0), TURN_rad / 2**bits
+    assert measured(stiffness_Nmprad, friction_Nm, resolution_rad, 0.3, 1, slip_rad=4e-3) is None
+    assert measured(stiffness_Nmprad, friction_Nm, resolution_rad, 0.3, 1) is not None
 
 
 def test_too_few_places_say_nothing() -> None:
