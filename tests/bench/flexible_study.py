@@ -34,7 +34,7 @@ from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import law_resolution_rad  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, quantile, random_plant  # noqa: E402
-from jointctl.tools.experiments.scenarios import (  # noqa: E402  # noqa: E402
+from jointctl.tools.experiments.scenarios import (  # noqa: E402
     RANDOM_MOTIONS,
     Controller,
     ErrorFigures,

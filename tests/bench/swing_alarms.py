@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 from jointctl.firmware_py.states import Fault, Notice  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
-from jointctl.tools.experiments.scenarios import Change, Scenario, controller_constants, named, run_scenario  # noqa: E402  # noqa: E402
+from jointctl.tools.experiments.scenarios import Change, Scenario, controller_constants, named, run_scenario  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 
 MOTIONS: tuple[Scenario, ...] = get_args(Change)

@@ -117,6 +117,12 @@ def held_beyond_degC(warm: FrictionTemperature) -> tuple[float, float]:
     return reference - HELD_BEYOND_K if low is None else low, reference + HELD_BEYOND_K if high is None else high
 
 
+def static_frictions_Nm(config: Config, friction: Friction) -> tuple[float, float]:
+    """Of either direction at the joint, both positive; without what load, temperature and angle do to it."""
+    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
+    return abs(friction.positive.ts_Nm) * ratio, abs(friction.negative.ts_Nm) * ratio
+
+
 def static_friction_Nm(config: Config) -> float | None:
     """The larger one of both directions, at the joint, under gravity and at the temperature at which it is greatest.
 
@@ -125,8 +131,7 @@ def static_friction_Nm(config: Config) -> float | None:
     friction = config.friction
     if friction is None:
         return None
-    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
-    static_Nm = max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio
+    static_Nm = max(static_frictions_Nm(config, friction))
     if friction.load is not None:
         static_Nm += friction.load.coulomb * abs(config.joint.gravity_Nm)
     if friction.temperature is not None:

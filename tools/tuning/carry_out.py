@@ -175,6 +175,7 @@ class ShownConsent(TerminalConsent):
 
 
 VERIFY_s = 30.0
+SWEEP_SHARE = 0.7  # of limits.velocity_max_radps, in the friction step: a soft reducer swings about the speed
 
 
 def with_motion(config: Config, motion: Trajectory) -> Config:

@@ -31,10 +31,14 @@ from jointctl.drivers.errors import LimitCycle, text_Nm
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import law_resolution_rad, period_s, static_friction_Nm
+from jointctl.tools.configuration.conversions import (
+    law_resolution_rad,
+    period_s,
+    static_friction_Nm,
+    static_frictions_Nm,
+)
 from jointctl.tools.configuration.found_values import Found, rounded
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
-from jointctl.tools.configuration.sections import Friction
 from jointctl.tools.session.plan import Placed, joint_lines, remark_lines
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.frequency_response import motor_fed, room_rad
@@ -138,7 +142,7 @@ class PreslidingMotion:
 def presliding_motion(config: Config) -> PreslidingMotion | None:
     """For a rigid joint whose friction is known; None where the travel is too short, or no spring keeps the margin."""
     static_Nm, limits = static_friction_Nm(config) or 0.0, config.limits
-    if config.friction is None or static_Nm == 0.0:
+    if config.friction is None or min(static_frictions_Nm(config, config.friction)) == 0.0:
         return None
     sides = (config.friction.positive, config.friction.negative)
     rests_at = [min(max(abs(one.tc_Nm / one.ts_Nm), LEAST_REST), MOST_REST) for one in sides]
@@ -257,18 +261,18 @@ def _missed(stretches: list[Stretch], compliance: float, noise_counts: float) ->
     return missed
 
 
-def _likelihoods(stretches: list[Stretch], counts_pNm: Array, noise_counts: float) -> Array:
-    """Logarithm, of each compliance, of all places."""
+def _likelihoods(stretches: list[Stretch], counts_pNm: Array, noise_counts: float) -> tuple[Array, Array]:
+    """Logarithm of all places, and the mean square [counts^2] of what is missed at their best, of each compliance."""
     missed = [_missed(stretches, float(compliance), noise_counts) for compliance in counts_pNm]
-    least = np.array([[np.min(one) for one in places] for places in missed])  # (compliances, places)
+    least = np.array([np.mean([np.min(one) for one in places]) for places in missed])
     independent = [0.5 * len(one.counts) * BIN_s / INDEPENDENT_s for one in stretches]
     size2, total = LEAST_MISSED**2, np.zeros(len(missed))
     for _ in range(3):
         for k, places in enumerate(missed):
             shares = [np.mean(np.exp(-n * one / size2)) for n, one in zip(independent, places, strict=True)]
             total[k] = np.sum(np.log(np.array(shares) + 1e-300))
-        size2 = max(LEAST_MISSED**2, float(np.mean(least[np.argmax(total)])))
-    return total
+        size2 = max(LEAST_MISSED**2, float(least[np.argmax(total)]))
+    return total, least
 
 
 def fit_bristles(
@@ -278,17 +282,16 @@ def fit_bristles(
     if len(stretches) < LEAST_STRETCHES:
         return None
 
-    def likely(bends: Array) -> tuple[int, int, int]:
-        """Indices of the most likely one and of the ends of the interval."""
-        total = _likelihoods(stretches, bends / (static_Nm * resolution_rad), noise_counts)
-        allowed = np.flatnonzero(total > np.max(total) - INTERVAL)
-        return int(np.argmax(total)), int(allowed[0]), int(allowed[-1])
+    def likely(bends: Array) -> tuple[int, int, int, float]:
+        """Indices of the most likely one and of the ends of the interval, and the mean square that it misses."""
+        total, missed = _likelihoods(stretches, bends / (static_Nm * resolution_rad), noise_counts)
+        allowed, best = np.flatnonzero(total > np.max(total) - INTERVAL), int(np.argmax(total))
+        return best, int(allowed[0]), int(allowed[-1]), float(missed[best])
 
-    _, low, high = likely(COARSE)
+    _, low, high, _ = likely(COARSE)
     bends = np.linspace(COARSE[max(low - 1, 0)], COARSE[min(high + 1, len(COARSE) - 1)], FINE)
-    best, low, high = likely(bends)
+    best, low, high, missed = likely(bends)
     compliance = float(bends[best]) / (static_Nm * resolution_rad)
-    missed = np.mean([np.min(one) for one in _missed(stretches, compliance, noise_counts)])
     if missed > max(SLIPPED**2, np.mean([np.var(compliance * one.bend) for one in stretches])):
         return None
     quiet = max(1.0 - noise_counts / NOISE_THAT_HELPS, 0.0)
@@ -321,12 +324,6 @@ def bristles_of(motion: PreslidingMotion, records: np.recarray, friction_Nm: tup
 
 QUARTER = 0.25  # of a count, by which bristles bend at the static friction: stiffer ones end moves worse
 DAMPING_RATIO = 0.24  # of the bristles with the joint's inertia: that of the shipped configurations
-
-
-def static_frictions_Nm(config: Config, friction: Friction) -> tuple[float, float]:
-    """Of either direction at the joint, both positive."""
-    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
-    return ratio * abs(friction.positive.ts_Nm), ratio * abs(friction.negative.ts_Nm)
 
 
 def measured_bristles(config: Config, carrier: Carrier) -> dict[str, Any]:

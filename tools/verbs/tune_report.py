@@ -17,7 +17,7 @@ from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
-from jointctl.tools.tuning.carry_out import VERIFY_s, response_task
+from jointctl.tools.tuning.carry_out import SWEEP_SHARE, VERIFY_s, response_task
 from jointctl.tools.tuning.frequency_response import bode_figure
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text
 from jointctl.tools.verbs.map import speeds_in_turn
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from jointctl.tools.verbs.tune_steps import Tune
 
-SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz", "link_cutoff_Hz")  # that are shown
 
 

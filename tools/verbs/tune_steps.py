@@ -65,6 +65,7 @@ from jointctl.tools.sweeping.plan import refuse_constants
 from jointctl.tools.tuning.carry_out import (
     ALONE,
     LEAST_LEGS,
+    SWEEP_SHARE,
     Carrier,
     NotCarriedOut,
     TooWeak,
@@ -90,7 +91,7 @@ from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
-from jointctl.tools.verbs.tune_report import SWEEP_SHARE, values_of, write_report
+from jointctl.tools.verbs.tune_report import values_of, write_report
 from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "bristles", "map", "gains", "verification")
@@ -199,9 +200,8 @@ class Tune:
             if about not in (own, {**own, "configuration": kept.get("written")}):
                 raise DataError(f"{path}: is of another configuration or torque than {original.path}, {OTHER}", ANEW)
             steps = STEPS if kept.get("asked") == asked else STEPS[: STEPS.index("gains")]  # another law or objective
-            self.state = {
-                name: kept[name] for name in takewhile(kept.__contains__, steps)
-            }  # one that is missing is made
+            known = takewhile(kept.__contains__, steps)  # one that is missing is made, and what follows anew
+            self.state = {name: kept[name] for name in known}
         elif not self.carrier.consent.dry_run:
             path.unlink(missing_ok=True)  # a later --resume must not go on with an older tune's steps
         self._about = {"about": about, "asked": asked}

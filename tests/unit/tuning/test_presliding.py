@@ -168,6 +168,11 @@ def test_the_joint_is_pushed_less_than_breaks_it_away_and_its_reading_is_watched
         assert not np.any(placed.table[:, 2:])
 
 
+FRICTION = shipped("precise").friction
+assert FRICTION is not None
+ONE_SIDED = FRICTION.model_copy(update={"negative": FRICTION.negative.model_copy(update={"ts_Nm": 0.0, "tc_Nm": 0.0})})
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -175,6 +180,7 @@ def test_the_joint_is_pushed_less_than_breaks_it_away_and_its_reading_is_watched
         {"joint__inertia_kgm2": 1e-4},
         {"loop__rate_Hz": 25.0, "margin__loop_delay_s": 0.1},
         {"friction": None, "control__feed_forward": "none"},
+        {"friction": ONE_SIDED},
     ],
 )
 def test_where_it_cannot_be_it_is_left_out(changes: dict[str, Any]) -> None:
