@@ -27,9 +27,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from jointctl.tools.analysis.gains import converging  # noqa: E402
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, loop_settings  # noqa: E402
-from jointctl.tools.analysis.margins import largest_sensitivity, learning_convergence  # noqa: E402
+from jointctl.tools.analysis.margins import converging, largest_sensitivity, learning_convergence  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.conversions import law_resolution_rad  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402

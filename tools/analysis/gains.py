@@ -45,9 +45,9 @@ from jointctl.tools.analysis.linear_loop import (
     sampled_joint,
     two_masses,
 )
-from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence, margins_on_grid
-from jointctl.tools.configuration.checks import OBSERVING as OBSERVING_LAWS
-from jointctl.tools.configuration.config import Adaptation, Config, Control, Learning
+from jointctl.tools.analysis.margins import cases, converging, margins_on_grid
+from jointctl.tools.configuration.checks import OBSERVING
+from jointctl.tools.configuration.config import Adaptation, Config, Control
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
 from jointctl.tools.configuration.load import shipped_control
 
@@ -82,9 +82,6 @@ USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for anot
 UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it; of the link's filter as well
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 RIPPLE_OF_TWO_radps = 100.0  # docs/law-measured.md: what disturbs such a joint falls with the frequency up to there
-LEARNING_FACTOR = 0.9  # of a repetition, wanted
-SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
-LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 120)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 3, 90
@@ -463,7 +460,7 @@ def gains_of_file(config: Config, settings: LoopSettings) -> ChosenGains:
     else:
         known = ", ".join(("flexible_joint", *OF_RIGID))
         raise ConfigurationError(f"{config.path}: gains are chosen for control.kind (={kind}) of {known} only")
-    if kind in OBSERVING_LAWS:
+    if kind in OBSERVING:
         settings = replace(settings, observer_delay_cycles=_observed_late(settings.delay_s + settings.lag_s, config))
     believed = replace(BELIEVED, friction_radps2=(static_friction_Nm(config) or 0.0) / config.joint.inertia_kgm2)
     return _chosen(config, law, believed, settings, "tracking")
@@ -539,7 +536,7 @@ def _control(config: Config, control: Control) -> Control:
     elif config.friction.lugre is None and feed_forward == "lugre_desired":
         feed_forward = "desired"
     adaptation, paired = None, False
-    observes = control.kind in OBSERVING_LAWS
+    observes = control.kind in OBSERVING
     if observes and feed_forward == "lugre_desired":
         adaptation = config.control.adaptation or Adaptation()
         paired = control.kind != "flexible_joint"  # which pairs anyway
@@ -577,24 +574,3 @@ def apart(one: LoopSettings, other: LoopSettings) -> float:
     """Greatest difference of the gains, of their logarithms."""
     pairs = [(getattr(one, key), getattr(other, key)) for key in ("kv", "observer_radps", "cutoff_Hz")]
     return max((abs(math.log(a / b)) for a, b in pairs if a > 0.0 and b > 0.0), default=0.0)
-
-
-def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
-    """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain.
-
-    Where that brings none to `LEARNING_FACTOR`, the quickest that converges, of a late loop the next one; or None.
-    """
-    if learning is None or settings.kind not in OBSERVING:
-        return None
-    slow: list[tuple[float, Learning]] = []
-    for _ in range(8):
-        factor = learning_convergence(settings, learning).worst_factor
-        if factor <= LEARNING_FACTOR:
-            return learning
-        if factor <= SLOWEST_LEARNING_FACTOR:
-            slow.append((factor, learning))
-        learning = learning.model_copy(
-            update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
-        )
-    late = len(slow) > 1 and slow[0][0] > LATE_LEARNING_FACTOR
-    return slow[int(late)][1] if slow else None

@@ -68,10 +68,11 @@ class StateSpace:
         `scipy.signal.dfreqresp` gives the same margins to eight digits; but its import takes several times as long as
         all margins together, which every start of a motion would wait for, and below 1 mHz it is badly conditioned.
         """
-        matrices = z[:, None, None] * np.eye(len(self.a)) - self.a
-        solved = np.linalg.solve(matrices, np.broadcast_to(self.b, (len(z), *self.b.shape)))
-        response: ComplexArray = np.asarray(self.c @ solved + self.d, dtype=np.complex128)
-        return response
+        n = len(self.a)
+        matrices = np.tile(-self.a.ravel().astype(np.complex128), (len(z), 1))
+        matrices[:, :: n + 1] += z[:, None]  # the diagonals
+        solved = np.linalg.solve(matrices.reshape(len(z), n, n), self.b)
+        return np.asarray(self.c @ solved + self.d, dtype=np.complex128)
 
 
 def _hold_step(step_s: float, lag_s: float, inertia_kgm2: float) -> tuple[Array, Array]:

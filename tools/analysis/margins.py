@@ -402,32 +402,76 @@ class Convergence:
     remaining_1_Hz: float  # share of a disturbance at 1 Hz that stays in the end
 
 
-def repetition_factor(settings: LoopSettings, learning: Learning, omega_radps: Array) -> tuple[Array, Array]:
-    """(|M|, |1 - S| / |1 - M|) at these frequencies [rad/s], arrays (N,)."""
-    loop = linear_loop(settings)
-    z = np.exp(1j * omega_radps * settings.period_s)
-    open_loop = loop.open_loop(omega_radps)
-    moved = loop.joint.response(z)[:, 0, 0] / (1.0 + open_loop)
-    taken = open_loop / (1.0 + open_loop)
-    width = learning.half_width_cycles
-    smoothing = np.ones_like(omega_radps)
-    for k in range(1, width + 1):
-        smoothing = smoothing + 2.0 * np.cos(k * omega_radps * settings.period_s)
-    smoothing = smoothing / (2 * width + 1)
-    seen = taken + settings.inertia_kgm2 * learning.error_gain_ps2 * moved
-    factor = smoothing * (1.0 - learning.gain * z**learning.lead_cycles * seen)
-    return np.abs(factor), np.abs(1.0 - smoothing) / np.abs(1.0 - factor)
+@dataclass(frozen=True)
+class RepeatedLoop:
+    """One joint's loop as learning meets it: P and L at frequencies (N,) of which the last is 1 Hz."""
+
+    settings: LoopSettings
+    omega_radps: Array
+    plant: ComplexArray
+    open_loop: ComplexArray
+
+    def convergence(self, learning: Learning) -> Convergence:
+        factor, remaining = self.factor(learning)
+        worst = int(np.argmax(factor[:-1]))
+        return Convergence(float(factor[worst]), float(self.omega_radps[worst]) / math.tau, float(remaining[-1]))
+
+    def factor(self, learning: Learning) -> tuple[Array, Array]:
+        """(|M|, |1 - S| / |1 - M|) at its frequencies, arrays (N,)."""
+        angles = self.omega_radps * self.settings.period_s
+        moved = self.plant / (1.0 + self.open_loop)
+        taken = self.open_loop / (1.0 + self.open_loop)
+        width = learning.half_width_cycles
+        smoothing = np.ones_like(angles)
+        for k in range(1, width + 1):
+            smoothing = smoothing + 2.0 * np.cos(k * angles)
+        smoothing = smoothing / (2 * width + 1)
+        seen = taken + self.settings.inertia_kgm2 * learning.error_gain_ps2 * moved
+        factor = smoothing * (1.0 - learning.gain * np.exp(1j * angles * learning.lead_cycles) * seen)
+        return np.abs(factor), np.abs(1.0 - smoothing) / np.abs(1.0 - factor)
+
+
+def repeated_loops(settings: LoopSettings) -> list[RepeatedLoop]:
+    """One for each joint that the loop must bear; the law is the same for all of them."""
+    omega = np.append(frequencies_radps(settings.period_s), math.tau)
+    z = np.exp(1j * omega * settings.period_s)
+    law = linear_loop(settings).controller.response(z)
+    plants = [(case, linear_loop(case).joint.response(z)) for case in cases(settings)]
+    return [RepeatedLoop(case, omega, plant[:, 0, 0], -(law @ plant)[:, 0, 0]) for case, plant in plants]
+
+
+def slowest_convergence(loops: list[RepeatedLoop], learning: Learning) -> Convergence:
+    """Convergence of this learning on the joint that it is worst for."""
+    return max((loop.convergence(learning) for loop in loops), key=lambda one: one.worst_factor)
 
 
 def learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
-    """Convergence of this learning on this loop; of several joints with the worst one."""
-    found = [_learning_convergence(case, learning) for case in cases(settings)]
-    return max(found, key=lambda one: one.worst_factor)
+    """The same of the joints that the loop must bear."""
+    return slowest_convergence(repeated_loops(settings), learning)
 
 
-def _learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
-    omega = frequencies_radps(settings.period_s)
-    factor, _ = repetition_factor(settings, learning, omega)
-    worst = int(np.argmax(factor))
-    _, remaining = repetition_factor(settings, learning, np.array([math.tau]))
-    return Convergence(float(factor[worst]), float(omega[worst]) / math.tau, float(remaining[0]))
+LEARNING_FACTOR = 0.9  # of a repetition, wanted
+SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
+LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
+
+
+def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
+    """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain.
+
+    Where that brings none to `LEARNING_FACTOR`, the quickest that converges, of a late loop the next one; or None.
+    """
+    if learning is None or settings.kind not in OBSERVING:
+        return None
+    slow: list[tuple[float, Learning]] = []
+    loops = repeated_loops(settings)
+    for _ in range(8):
+        factor = slowest_convergence(loops, learning).worst_factor
+        if factor <= LEARNING_FACTOR:
+            return learning
+        if factor <= SLOWEST_LEARNING_FACTOR:
+            slow.append((factor, learning))
+        learning = learning.model_copy(
+            update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
+        )
+    late = len(slow) > 1 and slow[0][0] > LATE_LEARNING_FACTOR
+    return slow[int(late)][1] if slow else None

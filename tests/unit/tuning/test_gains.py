@@ -23,14 +23,13 @@ from jointctl.tools.analysis.gains import (
     LEAST_LATE_s,
     PHASE_MARGIN_deg,
     choose_gains,
-    converging,
     gains_of_file,
     joints_within,
     lossless_joints,
     steady_joints,
 )
 from jointctl.tools.analysis.linear_loop import Encoders, LoopSettings, TwoMasses, linear_loop, loop_settings
-from jointctl.tools.analysis.margins import learning_convergence, margins
+from jointctl.tools.analysis.margins import converging, learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
 from jointctl.tools.configuration.load import load_config, shipped_config
