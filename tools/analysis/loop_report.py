@@ -21,7 +21,6 @@ from jointctl.tools.configuration.conversions import (
     velocity_of_a_count_radps,
 )
 from jointctl.tools.configuration.records import FROZEN_SHARE
-from jointctl.tools.configuration.sections import Trajectory
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -129,37 +128,23 @@ def _current_contradiction(config: Config) -> list[str]:
     ]
 
 
-def trajectory_acceleration(trajectory: Trajectory) -> float | None:
-    """The largest acceleration [rad/s2] of a trajectory; None where a file must be read first."""
-    if trajectory.kind == "sine":
-        parts = [trajectory] + ([trajectory.switch] if trajectory.switch else [])
-        return max(abs(p.amplitude_rad) * (math.tau * p.frequency_Hz) ** 2 for p in parts)
-    if trajectory.kind == "hold":
-        return 0.0
-    if trajectory.kind == "table":
-        return None
-    if trajectory.kind == "min_jerk":
-        # the quintic's peak: 10 / sqrt(3) of distance / time^2
-        return abs(trajectory.target_rad - trajectory.start_rad) / trajectory.move_s**2 * 10.0 / math.sqrt(3.0)
-    return float(trajectory.acceleration_radps2)
+def beyond_torque(config: Config, name: str, acceleration_radps2: float) -> list[str]:
+    """One line where the joint's inertia needs more torque for this acceleration than the limit leaves."""
+    inertia, limit_Nm = config.joint.inertia_kgm2, config.limits.torque_max_Nm
+    free_Nm = limit_Nm - abs(config.joint.gravity_Nm)
+    if inertia * acceleration_radps2 <= free_Nm:
+        return []
+    return [
+        f"joint.inertia_kgm2 (={inertia:g}) times {name} (={acceleration_radps2:.3g} rad/s2) is "
+        f"{inertia * acceleration_radps2:.3g} Nm: limits.torque_max_Nm (={limit_Nm:g}) leaves {free_Nm:.3g} Nm beside "
+        "gravity"
+    ]
 
 
 def _inertia_contradictions(config: Config) -> list[str]:
-    """Inertia against torque: too much of it for the motion and for braking, or too little to be true."""
+    """Inertia against torque: too much of it for braking, or too little to be true."""
     inertia, limits = config.joint.inertia_kgm2, config.limits
-    free_Nm = limits.torque_max_Nm - abs(config.joint.gravity_Nm)
-    found = []
-    wanted = (
-        ("the trajectory's largest acceleration", trajectory_acceleration(config.trajectory)),
-        ("sequence.brake_radps2", config.sequence.brake_radps2),
-    )
-    for name, acceleration in wanted:
-        if acceleration is not None and inertia * acceleration > free_Nm:
-            found.append(
-                f"joint.inertia_kgm2 (={inertia:g}) times {name} (={acceleration:.3g} rad/s2) is "
-                f"{inertia * acceleration:.3g} Nm: limits.torque_max_Nm (={limits.torque_max_Nm:g}) leaves "
-                f"{free_Nm:.3g} Nm beside gravity"
-            )
+    found = beyond_torque(config, "sequence.brake_radps2", config.sequence.brake_radps2)
     step = limits.torque_max_Nm / inertia / config.loop.rate_Hz
     if step > limits.velocity_max_radps:
         found.append(

@@ -301,6 +301,13 @@ def _fill_stream(record: StreamConstants, config: Config) -> None:
         setattr(record, key, automatic if isinstance(chosen, str) else chosen)
 
 
+def trajectory_constants(config: Config, table: np.ndarray) -> TrajectoryConstants:
+    """One record of [trajectory]."""
+    record: TrajectoryConstants = new(TrajectoryConstants)[0]
+    fill_trajectory(record, config, table)
+    return record
+
+
 def fill_trajectory(record: TrajectoryConstants, config: Config, table: np.ndarray) -> None:
     """`TrajectoryConstants` of [trajectory]; `table` as in `axis_constants`."""
     trajectory = config.trajectory
@@ -416,9 +423,7 @@ def approach_s(config: Config, table: np.ndarray, start_position_rad: float | No
     if not isinstance(chosen, str):
         return float(chosen)
     limits = config.limits
-    constants = new(TrajectoryConstants)
-    fill_trajectory(constants[0], config, table)
-    start = approach_start(constants[0], table)
+    start = approach_start(trajectory_constants(config, table), table)
     speed = max(APPROACH_SPEED * limits.velocity_max_radps, 1.2 * abs(float(start.velocity_radps)))
     acceleration = max(config.sequence.brake_radps2, 1.2 * abs(float(start.acceleration_radps2)))
     ends = (limits.position_min_rad, limits.position_max_rad)

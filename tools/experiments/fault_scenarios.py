@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.observers import low_pass_gain
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
@@ -37,7 +37,7 @@ from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import fill_trajectory
+from jointctl.tools.configuration.records import trajectory_constants
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
@@ -313,8 +313,7 @@ class Program:
 def set_points_of(program: Program, config: Config, table: np.ndarray) -> np.ndarray:
     """Rows of `hil.lockstep.Scenario.set_points`: at rest for `BEFORE_s`, then the trajectory, from rest to rest."""
     shown = config.changed(trajectory=program.trajectory)
-    trajectory, at = new(TrajectoryConstants)[0], new(Reference)[0]
-    fill_trajectory(trajectory, shown, table)
+    trajectory, at = trajectory_constants(shown, table), new(Reference)[0]
     lasts_s = program.trajectory.duration_s
     times_s = np.arange(0.0, BEFORE_s + lasts_s, program.every_s)
     points = np.zeros((len(times_s), 5))

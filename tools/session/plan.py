@@ -33,6 +33,7 @@ from jointctl.tools.configuration.records import (
     fill_trajectory,
     free_constants,
     stacked_tables,
+    trajectory_constants,
     trajectory_table,
 )
 from jointctl.tools.configuration.sections import Limits
@@ -311,9 +312,7 @@ class ConfiguredMotion:
         """`MotionFault` if there is no approach and the trajectory begins elsewhere: it would be pulled there."""
         if self.config.sequence.approach_s != 0.0:
             return
-        constants = new(TrajectoryConstants)
-        fill_trajectory(constants[0], self.config, self.table)
-        first_rad = float(approach_start(constants[0], self.table).position_rad)
+        first_rad = float(approach_start(trajectory_constants(self.config, self.table), self.table).position_rad)
         allowed_rad = START_SHARE * self.config.limits.following_error_max_rad
         if not abs(first_rad - start_position_rad) <= allowed_rad:
             raise MotionFault(

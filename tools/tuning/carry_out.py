@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
-from jointctl.firmware_py.motion_records import TrajectoryConstants
-from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
@@ -28,7 +26,7 @@ from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import static_friction_Nm
 from jointctl.tools.configuration.found_values import Found, rounded, with_sliding, with_values
-from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.configuration.records import axis_constants, trajectory_constants, trajectory_table
 from jointctl.tools.configuration.sections import MinJerk, Trajectory
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
@@ -198,9 +196,7 @@ def verifying_motion(config: Config) -> Trajectory:
             (axis,) = axis_constants(moving, table, start_position_rad=start_rad)
             require_approach(limits, axis, table, start_rad)
     except (ConfigurationError, MotionFault):
-        constants = new(TrajectoryConstants)
-        fill_trajectory(constants[0], config, table)
-        low, high, speed, acceleration = peak_of(constants[0], table)
+        low, high, speed, acceleration = peak_of(trajectory_constants(config, table), table)
         way = high - low
         move_s = max(QUINTIC_PEAK_SPEED * way / speed, math.sqrt(QUINTIC_PEAK_ACCELERATION * way / acceleration))
         return MinJerk(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import MotionFault, UsageError, blamed, text_Nm
+from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, blamed, text_Nm
 from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -44,7 +44,7 @@ def check(
             raise UsageError("--figure and --choose-gains are for one joint's file, not for an arm's")
         return check_arm(config, output, delay_s, allow_low_margin=allow_low_margin)
     from jointctl.tools.analysis.linear_loop import loop_settings
-    from jointctl.tools.analysis.loop_report import contradictions, not_modelled, outside_payload_range
+    from jointctl.tools.analysis.loop_report import not_modelled, outside_payload_range
     from jointctl.tools.analysis.margin_gate import (
         learning_of,
         meets,
@@ -76,7 +76,7 @@ def check(
     table = _table(analysis)
     for row in drive.check_rows(config):
         table.add_row(*row)
-    learning, warnings = learning_of(config, settings), [*contradictions(config), *_unbraked(config)]
+    learning, warnings = learning_of(config, settings), _warnings(config)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         value += "" if learning.worst_factor < 1.0 else ": diverges"
@@ -108,20 +108,25 @@ def check(
     return 0
 
 
-def _unbraked(config: Config) -> Iterator[str]:
-    """Why `run` would refuse the motion: known without a file of it."""
-    from jointctl.firmware_py.motion_records import TrajectoryConstants
-    from jointctl.firmware_py.schema import new
-    from jointctl.tools.configuration.records import fill_trajectory, trajectory_table
+def _warnings(config: Config) -> list[str]:
+    """Constants that contradict each other, and why `run` would refuse the motion or lack the torque for it."""
+    from jointctl.firmware_py.trajectory import peak_of
+    from jointctl.tools.analysis.loop_report import beyond_torque, contradictions
+    from jointctl.tools.configuration.records import trajectory_constants, trajectory_table
     from jointctl.tools.session.plan import require_braking
 
-    if config.trajectory.kind != "table":
-        trajectory, table = new(TrajectoryConstants), trajectory_table(config)
-        fill_trajectory(trajectory[0], config, table)
-        try:
-            require_braking(config, trajectory[0], table)
-        except MotionFault as error:
-            yield f"{error.message}; {error.hint}"
+    found = contradictions(config)
+    try:
+        table = trajectory_table(config)
+        trajectory = trajectory_constants(config, table)
+        acceleration = peak_of(trajectory, table).acceleration_radps2
+        found += beyond_torque(config, "the trajectory's largest acceleration", acceleration)
+        require_braking(config, trajectory, table)
+    except ConfigurationError as error:
+        found.append(error.message.removeprefix(f"{config.path}: "))
+    except MotionFault as error:
+        found.append(f"{error.message}; {error.hint}")
+    return found
 
 
 def check_cascade(
@@ -130,7 +135,6 @@ def check_cascade(
     """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
     from jointctl.drivers.canopen.eds import read_eds
     from jointctl.tools.analysis.linear_loop import loop_settings
-    from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import cascade_margins, cascade_of, cascade_unknowns, require_cascade
     from jointctl.tools.configuration.canopen import canopen_section, eds_path
     from jointctl.tools.verbs.bench_drive import bench_of
@@ -166,7 +170,7 @@ def check_cascade(
         enough = all(loop.stable and loop.phase_margin_deg >= wanted_deg for loop in found)
         wanted = f"at least {wanted_deg:g} deg wanted (margin.min_phase_margin_deg)"
         table.add_row("verdict", "ok" if enough else "too small", wanted)
-    warnings = [*contradictions(config), *_unbraked(config)]
+    warnings = _warnings(config)
     data = {
         "mode": section.mode, "lead_s": lead, "loops": [asdict(loop) for loop in found],
         "min_phase_margin_deg": wanted_deg, "warnings": warnings,
@@ -183,14 +187,13 @@ def check_cascade(
 def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False) -> int:
     """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
     from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
-    from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import require_loop
     from jointctl.tools.session.canopen_drive import require_buses
     from jointctl.tools.session.plan import resolve_arm
 
     require_buses(arm.joints)
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
-    warnings = [f"{config.path}: {line}" for config in arm.joints for line in contradictions(config)]
+    warnings = [f"{config.path}: {line}" for config in arm.joints for line in _warnings(config)]
     table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
     for budget in budgets:
         note = (

@@ -61,15 +61,54 @@ def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
     assert 'control.feed_forward = "measured"' in messages
 
 
-@pytest.mark.parametrize("name", ["virtual", "csp"])
-def test_a_motion_that_could_not_be_braked_is_a_warning(tmp_path: Path, name: str) -> None:
-    quick = {"kind": "min_jerk", "duration_s": 9.0, "start_rad": -0.5, "target_rad": 0.5, "move_s": 0.8}
-    for move_s, warned in ((0.8, True), (2.0, False)):
-        changes = {"trajectory": {**quick, "move_s": move_s}, "limits__velocity_max_radps": 3.0}
+def motion_of(folder: Path, kind: str, move_s: float) -> dict[str, Any]:
+    """From -0.5 to 0.5 rad in this time."""
+    if kind == "table":
+        times = [move_s * k / 50 for k in range(51)]
+        rows = [f"{t},{-0.5 * math.cos(math.pi * t / move_s)}" for t in times]
+        (folder / "way.csv").write_text("\n".join(["time_s,position_rad", *rows, ""]))
+        return {"kind": "table", "duration_s": 9.0, "file": "way.csv"}
+    return {"kind": "min_jerk", "duration_s": 9.0, "start_rad": -0.5, "target_rad": 0.5, "move_s": move_s}
+
+
+@pytest.mark.parametrize(("name", "kind"), [("virtual", "min_jerk"), ("csp", "min_jerk"), ("virtual", "table")])
+def test_a_motion_that_could_not_be_braked_is_a_warning(tmp_path: Path, name: str, kind: str) -> None:
+    for move_s, warned in ((0.7, True), (2.0, False)):
+        changes = {"trajectory": motion_of(tmp_path, kind, move_s), "limits__velocity_max_radps": 3.0}
         config = load_config(written(tmp_path / "j.toml", name, **changes))
         shown, messages, code = run_check(config, json=True)
         assert any("sequence.brake_radps2 (=2), must be" in line for line in json.loads(shown)["warnings"]) is warned
         assert ("warning: at " in messages, code) == (warned, 0)
+
+
+@pytest.mark.parametrize("kind", ["sine", "min_jerk", "table"])
+@pytest.mark.parametrize(("share", "warned"), [(0.98, False), (1.02, True)])
+def test_a_motion_that_needs_more_than_the_torque_limit_is_a_warning(
+    tmp_path: Path, kind: str, share: float, warned: bool
+) -> None:
+    sine = {"kind": "sine", "duration_s": 9.0, "amplitude_rad": 0.35, "frequency_Hz": 0.5}
+    peaks = {"sine": 0.35 * math.pi**2, "min_jerk": 10.0 / math.sqrt(3.0) / 4.0, "table": 0.5 * (math.pi / 2.0) ** 2}
+    changes: dict[str, Any] = {
+        "trajectory": sine if kind == "sine" else motion_of(tmp_path, kind, 2.0), "joint__gravity_Nm": 10.0,
+        "joint__inertia_kgm2": share * 50.0 / peaks[kind], "limits__torque_max_Nm": 60.0,
+        "sequence__brake_radps2": 0.9 * peaks[kind], "limits__velocity_max_radps": 2.0,
+    }  # fmt: skip
+    config = load_config(written(tmp_path / "j.toml", "virtual", **changes))
+    found = json.loads(run_check(config, json=True, allow_low_margin=True)[0])["warnings"]
+    assert any("the trajectory's largest acceleration" in line for line in found) is warned
+    assert warned or not any("beside gravity" in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [("time_s,position_rad\n0,0\n1,nothing\n", "trajectory.file: "), ("time_s,position_rad\n0,0\n1,9\n", "9 rad")],
+)
+def test_a_motion_file_that_a_run_would_refuse_is_a_warning(tmp_path: Path, rows: str, words: str) -> None:
+    (tmp_path / "way.csv").write_text(rows)
+    changes = {"trajectory": {"kind": "table", "duration_s": 9.0, "file": "way.csv"}}
+    shown, _, code = run_check(load_config(written(tmp_path / "j.toml", "virtual", **changes)), json=True)
+    assert code == 0
+    assert words in "\n".join(json.loads(shown)["warnings"])
 
 
 def test_learning_and_contradictions_are_in_the_json_too() -> None:

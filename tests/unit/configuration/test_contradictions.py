@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
 
-from jointctl.tools.analysis.loop_report import contradictions, trajectory_acceleration
+from jointctl.tools.analysis.loop_report import contradictions
 from jointctl.tools.configuration.conversions import law_resolution_rad, static_friction_Nm, velocity_of_a_count_radps
 from tests.configurations import shipped
 
@@ -50,14 +49,10 @@ def test_rated_values_and_torque_constant(factor: float, warned: bool) -> None:
 
 
 @pytest.mark.parametrize(("share", "warned"), [(0.99, False), (1.01, True)])
-def test_braking_and_motion_need_less_than_the_torque_limit(share: float, warned: bool) -> None:
+def test_braking_needs_less_than_the_torque_limit(share: float, warned: bool) -> None:
     limits, sequence = VIRTUAL.limits, VIRTUAL.sequence
     heavy = share * limits.torque_max_Nm / sequence.brake_radps2
     assert ("times sequence.brake_radps2" in lines(joint__inertia_kgm2=heavy)) is warned
-    acceleration = trajectory_acceleration(VIRTUAL.trajectory)
-    assert acceleration is not None
-    text = lines(joint__inertia_kgm2=share * limits.torque_max_Nm / acceleration)
-    assert ("the trajectory's largest acceleration" in text) is warned
     text = lines(joint__inertia_kgm2=heavy, joint__gravity_Nm=-limits.torque_max_Nm * 0.02)
     assert "times sequence.brake_radps2" in text
 
@@ -94,17 +89,3 @@ def test_a_soft_loop_is_held_by_friction_that_is_a_little_more(share: float, war
 def test_a_small_motion_is_no_softer(stiffness: float | None, warned: bool) -> None:
     found = contradictions(shipped("realistic", reducer__loop_stiffness_Nmprad=stiffness))
     assert any("hysteresis makes a small motion stiffer" in line for line in found) is warned
-
-
-def test_largest_accelerations() -> None:
-    class Motion:
-        kind = "min_jerk"
-        start_rad, target_rad, move_s = 0.0, 0.1, 3.0
-
-    times = [3.0 * k / 10000 for k in range(10001)]
-    quintic = [0.1 / 9.0 * (60 * s - 180 * s**2 + 120 * s**3) for s in (t / 3.0 for t in times)]
-    assert trajectory_acceleration(Motion()) == pytest.approx(max(quintic), rel=1e-4)
-    sine = VIRTUAL.trajectory
-    assert sine.kind == "sine"
-    expected = sine.amplitude_rad * (math.tau * sine.frequency_Hz) ** 2
-    assert trajectory_acceleration(sine) == pytest.approx(expected)
