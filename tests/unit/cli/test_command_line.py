@@ -64,6 +64,7 @@ def test_the_help_of_every_verb_says_what_it_does_and_loses_nothing_in_80_column
     shown = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"})
     assert shown.exit_code == 0
     assert "…" not in shown.output
+    assert "<bool>" not in shown.output  # a flag shows no type
     assert max(len(line) for line in shown.output.splitlines()) <= 80
 
 
@@ -371,11 +372,6 @@ def test_the_shell_completes_configurations_and_files_of_joints(
     assert completed(words, tmp_path) == expected
 
 
-@pytest.mark.parametrize(("words", "command"), [pytest.param(*both, id="-".join(both[0])) for both in commands()])
-def test_a_flag_shows_no_type(words: tuple[str, ...], command: Any) -> None:
-    assert "<bool>" not in CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"}).output
-
-
 @pytest.mark.parametrize(("text", "delay_s"), [("1.5 ms", 0.0015), ("1500us", 0.0015), ("0.0015", 0.0015)])
 def test_an_option_takes_a_quantity_with_its_unit(jointctl: Jointctl, text: str, delay_s: float) -> None:
     done = jointctl("check", "virtual", "--json", "--delay", text)
@@ -383,18 +379,17 @@ def test_an_option_takes_a_quantity_with_its_unit(jointctl: Jointctl, text: str,
     assert done.err == ("" if text == "0.0015" else f"{text} is read as 0.0015 s\n")
 
 
-@pytest.mark.parametrize("text", ["1.5 rpm", "1.5 m", "-1 ms"])
-def test_what_is_no_such_quantity_is_refused(jointctl: Jointctl, text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *((text, ("'--delay'",)) for text in ("1.5 rpm", "1.5 m", "-1 ms")),
+        ("1,5 ms", ("(=1,5 ms)", "; with a decimal point: 1.5 ms\n")),
+    ],
+)
+def test_what_is_no_such_quantity_is_refused(jointctl: Jointctl, text: str, words: tuple[str, ...]) -> None:
     done = jointctl("check", "virtual", "--delay", text)
     assert done.code == 2
-    assert "'--delay'" in done.err
-
-
-def test_a_decimal_comma_is_refused_with_the_point(jointctl: Jointctl) -> None:
-    done = jointctl("check", "virtual", "--delay", "1,5 ms")
-    assert done.code == 2
-    assert "(=1,5 ms)" in done.err
-    assert "; with a decimal point: 1.5 ms\n" in done.err
+    assert [word for word in words if word not in done.err] == []
 
 
 # --- Options that stand in a dataclass reach the verb as one object; the command line shows them one by one ---
@@ -430,10 +425,7 @@ def test_the_command_line_shows_the_options_of_a_group_in_their_place() -> None:
     command = typer.main.get_command(two_verbs)
     assert [parameter.name for parameter in command.params] == ["first", "name", "number", "last"]
     assert command.help == "What it does."
-
-
-def test_limits_of_an_option_hold_in_a_group() -> None:
-    assert CliRunner().invoke(two_verbs, ["--number", "0"]).exit_code == 2
+    assert CliRunner().invoke(two_verbs, ["--number", "0"]).exit_code == 2  # its limits hold
 
 
 # --- What each verb does with `-p PORT`, and with options and configurations of the other kind of drive ---

@@ -83,11 +83,9 @@ def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
         ("lyapunov_q = .*", "lyapunov_q = [1.0, 2.0, 3.0]",
          "control.lyapunov_q (=[1.0, 2.0, 3.0]) must be 1 or 2 numbers, each in (0..1e+12]"),
         ("widths = .*", "widths = 0.0", "control.widths (=0) must be 1 or 15 widths, each in (0..10000]"),
-        ("rate_Hz = .*", "rate_kHz = 1.0", f"loop.rate_kHz is not a known key: use rate_Hz{UNIT}"),
         ("inertia_kgm2", "inertia", "joint.inertia is not a known key: use inertia_kgm2 (the unit is part of the key)"),
         ("velocity_max_radps", "velocity_max_degps", f"limits.velocity_max_degps is not a known key:"
          f" use velocity_max_radps{UNIT}"),
-        ("feed_forward", "feed_foward", "control.feed_foward is not a known key: did you mean feed_forward?"),
         ("amplitude_rad", "amplitud_rad", "trajectory.amplitud_rad is not a known key: did you mean amplitude_rad?"),
         (r"\[limits\]", "[limit]", "[limit] is not a known section: did you mean limits?"),
         ("kind = \"sine\"", 'kind = "square"', "trajectory.kind (=square) must be one of 'sine', 'min_jerk',"
@@ -145,6 +143,7 @@ def test_the_range_that_the_reference_names_is_the_one_that_is_checked(
 def test_several_problems_are_told_at_once(tmp_path: Path) -> None:
     text = replaced(VIRTUAL, "kp = .*", "kp = -1.0")
     assert len(problems(tmp_path, "node = .*", "node = 0", text)) == 2
+    assert len(problems(tmp_path, "node = .*", "colour = 1")) == 2  # unknown, and the node is missing
 
 
 @pytest.mark.parametrize(
@@ -166,9 +165,9 @@ def test_several_problems_are_told_at_once(tmp_path: Path) -> None:
         ("stop_timeout_s = .*", "stop_timeout_s = 0.5", "sequence.stop_timeout_s (=0.5)"),
         ("node = .*", "node = 126", "drive.master_node (=126) must differ"),
         # a key in the wrong unit, or misspelt, is not reported as missing besides
-        ("rate_Hz = .*", "rate_kHz = 1.0", "loop.rate_kHz is not a known key"),
+        ("rate_Hz = .*", "rate_kHz = 1.0", f"loop.rate_kHz is not a known key: use rate_Hz{UNIT}"),
         ("amplitude_rad = .*", "amplitude_deg = 20.0", "trajectory.amplitude_deg is not a known key"),
-        ("feed_forward = .*", 'feed_foward = "none"', "control.feed_foward is not a known key"),
+        ("feed_forward = .*", 'feed_foward = "none"', "control.feed_foward is not a known key: did you mean feed_f"),
     ],
 )
 def test_a_contradiction_or_an_unknown_key_is_one_line(tmp_path: Path, pattern: str, line: str, expected: str) -> None:
@@ -200,24 +199,24 @@ def test_a_file_may_begin_with_the_mark_of_an_editor_and_end_its_lines_with_two_
     assert load_config(path).limits == load_config(shipped).limits
 
 
-def test_files_that_are_no_configuration_give_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match=r"none\.toml: no such file .*virtual"):
-        load_config(tmp_path / "none.toml")
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, r"joint\.toml: no such file .*virtual"),
+        (b"[bus]\n\xff\xfe", "byte 6 is not UTF-8"),
+        (b"[bus]\nchannel = \n", r"not valid TOML: .*line 2, column 11\): channel =$"),
+        (b"[joint]\ninertia_kgm2 = 0,5  # by CAD\n", r"inertia_kgm2 = 0,5 # by CAD; with a decimal point: 0\.5$"),
+        (b"bus = 3\n", r"bus \(=3\) must be a section: \[bus\]"),
+    ],
+)
+def test_files_that_are_no_configuration_give_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
+    path = tmp_path / "joint.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigurationError, match=words):
+        load_config(path)
     with pytest.raises(ConfigurationError, match="is a folder"):
         load_config(tmp_path)
-    path = tmp_path / "binary.toml"
-    path.write_bytes(b"[bus]\n\xff\xfe")
-    with pytest.raises(ConfigurationError, match="byte 6 is not UTF-8"):
-        load_config(path)
-    path.write_text("[bus]\nchannel = \n")
-    with pytest.raises(ConfigurationError, match=r"not valid TOML: .*line 2, column 11\): channel =$"):
-        load_config(path)
-    path.write_text("[joint]\ninertia_kgm2 = 0,5  # by CAD\n")
-    with pytest.raises(ConfigurationError, match=r"inertia_kgm2 = 0,5 # by CAD; with a decimal point: 0\.5$"):
-        load_config(path)
-    path.write_text("bus = 3\n")
-    with pytest.raises(ConfigurationError, match=r"bus \(=3\) must be a section: \[bus\]"):
-        load_config(path)
 
 
 def test_flag_beats_environment_beats_file() -> None:
@@ -257,10 +256,6 @@ def test_a_configuration_cannot_be_changed() -> None:
     config = load_config(shipped_config("virtual"))
     with pytest.raises(ValueError, match="frozen"):
         config.limits.torque_max_Nm = 1000.0  # type: ignore[misc]
-
-
-def test_a_key_that_is_missing_beside_an_unknown_one_is_still_told(tmp_path: Path) -> None:
-    assert len(problems(tmp_path, "node = .*", "colour = 1")) == 2
 
 
 # --- The keys of the limit-cycle monitor: defaults, what they become in the records, what is refused ---

@@ -382,22 +382,6 @@ def test_lines_of_one_joint_of_a_long_table(tmp_path, columns, ours):
 # --- what is wrong ---
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"time_unit": "min"}, r"--time-unit \(=min\) must be one of s, ms, us, ns"),
-        ({"position_unit": "count"}, "--counts-per-turn is missing"),
-        ({"reverse": ("current",)}, r"--reverse \(=current\) must be one of position, velocity, torque, load"),
-        ({"sample_rate_Hz": 200.0}, "--time-column and --sample-rate: give one of them"),
-        ({"temperature_unit": "C"}, r"--temperature-unit \(=C\) must be one of degC, K, degF"),
-        ({"torque_unit": "kNm"}, r"--torque-unit \(=kNm\) must be one of Nm, Ncm, mNm"),
-    ],
-)
-def test_a_unit_that_is_none_is_refused(tmp_path, columns, change, message):
-    with pytest.raises(UsageError, match=message):
-        read(tmp_path / "a.csv", columns, **change)
-
-
 def test_a_clock_in_another_unit_is_named(tmp_path, columns):
     with pytest.raises(DataError, match=r"t: usual step is 5 s: must be in \[1e-05..0.1\] s") as caught:
         read(tmp_path / "a.csv", {**columns, "t": columns["t"] * 1e3})

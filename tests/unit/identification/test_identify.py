@@ -7,7 +7,9 @@ import json
 import os
 import re
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -50,6 +52,15 @@ def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
+@contextmanager
+def refused(folder, error, words=None):
+    """What is tried is refused, and leaves the folder as it was."""
+    before = contents(folder)
+    with pytest.raises(error, match=words) as caught:
+        yield caught
+    assert contents(folder) == before
+
+
 @pytest.fixture
 def config(tmp_path):
     path = tmp_path / "joint.toml"
@@ -67,10 +78,8 @@ def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep
         assert word in html
     assert f"written: {page}" in out.stderr.getvalue()
     for wrong, told in ((sweep.parent / "found.txt", "must end in .html"), (sweep.parent / "no" / "a.html", "folder")):
-        before = contents(sweep.parent)
-        with pytest.raises(DataError, match=told):
+        with refused(sweep.parent, DataError, told):
             identify(sweep, output(), options=QUICK, report=wrong)
-        assert contents(sweep.parent) == before
 
 
 def test_points_that_are_left_out_are_told_even_to_who_wants_no_progress(sweep):
@@ -167,10 +176,8 @@ def test_the_snippet_is_what_the_configuration_reads():
 def test_a_protected_configuration_is_refused_before_the_fit(sweep, config, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != config)
     monkeypatch.setattr("jointctl.tools.verbs.identify._from_plateaus", None)  # the fit
-    before = contents(config.parent)
-    with pytest.raises(DataError, match="cannot be written: no permission"):
+    with refused(config.parent, DataError, "cannot be written: no permission"):
         identify(sweep, output(), into=config, options=QUICK)
-    assert contents(config.parent) == before
 
 
 def test_a_configuration_without_friction_gets_it(sweep, config):
@@ -216,10 +223,8 @@ def edited(path, old, new):
 )
 def test_nothing_is_written_after_an_error(sweep, config, spoil, error):
     spoil(config, sweep)
-    before = contents(sweep.parent)
-    with pytest.raises(error):
+    with refused(sweep.parent, error):
         identify(sweep, output(), into=config, options=QUICK)
-    assert contents(sweep.parent) == before
 
 
 def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, monkeypatch):
@@ -227,22 +232,15 @@ def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, 
         "jointctl.tools.identification.identification_report.section_values",
         lambda p, n: {**VALUES, "velocity_unit": "furlong"},
     )
-    before = contents(sweep.parent)
-    with pytest.raises(ConfigurationError, match=r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
+    with refused(sweep.parent, ConfigurationError, r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
         identify(sweep, output(), into=config, options=QUICK)
     assert ".joint." not in str(caught.value)  # the temporary file is nobody's business
-    assert contents(sweep.parent) == before
 
 
 def test_an_interruption_writes_nothing(sweep, config, monkeypatch):
-    def interrupted(*args, **keywords):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(identification, "run_swarms", interrupted)
-    before = contents(sweep.parent)
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(identification, "run_swarms", Mock(side_effect=KeyboardInterrupt))
+    with refused(sweep.parent, KeyboardInterrupt):
         identify(sweep, output(), into=config, options=QUICK)
-    assert contents(sweep.parent) == before
 
 
 def test_a_shipped_configuration_is_not_written_into(sweep, tmp_path, monkeypatch):
@@ -254,19 +252,15 @@ def test_a_shipped_configuration_is_not_written_into(sweep, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("name", ["sweep.csv", "sweep.json", "section"])
 def test_the_section_goes_into_a_toml_file_only(sweep, name):
-    before = contents(sweep.parent)
-    with pytest.raises(DataError, match=r"must end in \.toml"):
+    with refused(sweep.parent, DataError, r"must end in \.toml"):
         identify(sweep, output(), out=sweep.parent / name, options=QUICK)
-    assert contents(sweep.parent) == before
 
 
 def test_the_inputs_are_never_overwritten_and_a_missing_folder_is_told(sweep, config):
-    before = contents(sweep.parent)
-    with pytest.raises(DataError, match="is an input of this command"):
+    with refused(sweep.parent, DataError, "is an input of this command"):
         identify(sweep, output(), out=config, config=config, options=QUICK)
-    with pytest.raises(DataError, match="no folder"):
+    with refused(sweep.parent, DataError, "no folder"):
         identify(sweep, output(), into=config, out=sweep.parent / "none" / "x.toml", options=QUICK)
-    assert contents(sweep.parent) == before
 
 
 def test_json_output_is_one_document(sweep):

@@ -380,27 +380,24 @@ def test_some_samples_at_the_time_of_another_are_left_out_and_a_coarse_clock_is_
         ({"torque_column": None}, "--torque-column or --current-column is missing"),
         ({"torque_side": None}, "--torque-side is missing"),
         ({"ratio": None}, "--ratio is missing"),
-        ({"position_unit": "grad"}, r"--position-unit \(=grad\) must be one of rad, deg, turn"),
         ({"torque_column": None, "current_column": "tau"}, "--torque-constant is missing"),
+        ({"position_unit": "count"}, "--counts-per-turn is missing"),
+        ({"position_unit": "grad"}, r"--position-unit \(=grad\) must be one of rad, deg, turn"),
+        ({"time_unit": "min"}, r"--time-unit \(=min\) must be one of s, ms, us, ns"),
+        ({"temperature_unit": "C"}, r"--temperature-unit \(=C\) must be one of degC, K, degF"),
+        ({"torque_unit": "kNm"}, r"--torque-unit \(=kNm\) must be one of Nm, Ncm, mNm"),
+        ({"reverse": ("current",)}, r"--reverse \(=current\) must be one of position, velocity, torque, load"),
+        ({"sample_rate_Hz": 200.0}, "--time-column and --sample-rate: give one of them"),
+        (replace(SETTINGS, band_Hz=95.0), r"--band \(=95 Hz\) must be below 90 Hz"),
+        (replace(SETTINGS, speed_min_radps=-1.0), r"--speed-min \(=-1\) must be in"),
+        (replace(SETTINGS, acceleration_max_radps2=0.0), r"--acceleration-max \(=0\) must be in"),
+        (replace(SETTINGS, mean_samples=0), r"--mean-samples \(=0\)"),
     ],
 )
-def test_nothing_of_a_table_is_guessed(tmp_path, change, message):
+def test_what_is_missing_is_not_guessed_and_what_is_wrong_is_refused(tmp_path, change, message):
+    given, settings = (change, SETTINGS) if isinstance(change, dict) else ({}, change)
     with pytest.raises(UsageError, match=message):
-        read(tmp_path / "a.csv", motion_columns(seconds=5.0), **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"band_Hz": 95.0}, r"--band \(=95 Hz\) must be below 90 Hz"),
-        ({"speed_min_radps": -1.0}, r"--speed-min \(=-1\) must be in"),
-        ({"acceleration_max_radps2": 0.0}, r"--acceleration-max \(=0\) must be in"),
-        ({"mean_samples": 0}, r"--mean-samples \(=0\)"),
-    ],
-)
-def test_settings_out_of_range_are_refused(tmp_path, change, message):
-    with pytest.raises(UsageError, match=message):
-        read(tmp_path / "a.csv", motion_columns(seconds=5.0), replace(SETTINGS, **change))
+        read(tmp_path / "a.csv", motion_columns(seconds=5.0), settings, **given)
 
 
 def test_sizes_are_checked_against_a_configuration(tmp_path):
@@ -415,16 +412,6 @@ def test_sizes_are_checked_against_a_configuration(tmp_path):
 
 
 # --- sources: units, sides, run logs ---
-
-
-def test_units_sides_and_current_make_no_difference(tmp_path):
-    columns = motion_columns(seconds=10.0)
-    ours = read(tmp_path / "a.csv", columns)
-    theirs = {**columns, "q": np.degrees(columns["q"]) * 100.0, "tau": columns["tau"] / 100.0 / 0.1}
-    same = read(tmp_path / "b.csv", theirs, position_unit="deg", side="motor", torque_column=None,
-                current_column="tau", torque_constant_NmpA=0.1, torque_side=None)  # fmt: skip
-    for name in ("position_rad", "velocity_radps", "acceleration_radps2", "torque_Nm"):
-        assert getattr(same, name) == pytest.approx(getattr(ours, name), abs=1e-4)
 
 
 def test_differentiation_has_no_phase_and_the_band_that_it_states(tmp_path):

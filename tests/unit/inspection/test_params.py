@@ -214,11 +214,6 @@ class TestFiles:
         path.write_text(dcf_text(ParameterSet("x"), dictionary))
         assert load_parameters(path).parameters == {}
 
-    def test_negative_numbers_survive(self, tmp_path: Path) -> None:
-        path = tmp_path / "p.dcf"
-        path.write_text(dcf_text(ParameterSet("x", parameters={Place(0x6007): -1}), read_dictionary(EDS, 1)))
-        assert load_parameters(path).parameters[Place(0x6007)] == -1
-
     def test_a_configuration_is_no_parameter_file(self) -> None:
         assert not is_parameter_file(shipped_config("virtual"))
         assert not is_parameter_file(Path("virtual"))

@@ -294,13 +294,16 @@ def test_nothing_enables_twice_and_nothing_moves_after_a_stop(arm: jointctl.Arm)
             call()
 
 
-def test_it_is_deterministic() -> None:
+@pytest.mark.parametrize(("made", "target_rad"), [(jointctl.Joint, 0.2), (jointctl.Arm, DOWN_rad)])
+def test_it_is_deterministic(made: Any, target_rad: Any) -> None:
     logs = []
     for _ in range(2):
-        with jointctl.Arm("virtual", lockstep=True) as arm:
-            arm.enable()
-            arm.move_to(DOWN_rad, duration_s=0.5)
-        logs.append(arm.records)
+        with made("virtual", lockstep=True) as moved:
+            moved.enable()
+            moved.move_to(target_rad, duration_s=0.5)
+            moved.command(target_rad, time_s=0.0)
+            moved.step(0.2)
+        logs.append(moved.records)
     assert (logs[0] == logs[1]).all()
 
 

@@ -50,15 +50,13 @@ def streamed(joint: Joint, seconds: float, rate_Hz: float = RATE_Hz, *, velocity
         joint.step(1.0 / rate_Hz)
 
 
-def test_a_move_that_could_not_be_braked_is_refused_and_the_program_goes_on() -> None:
+def test_a_move_that_could_not_be_braked_is_refused_and_the_program_goes_on(joint: Joint) -> None:
     """It was begun, and ended the program by REFERENCE_LIMIT."""
-    with jointctl.Joint("virtual", lockstep=True) as joint:
-        joint.enable()
-        joint.move_to(0.19)
-        with pytest.raises(ConfigurationError, match=r"would come to rest at .* sequence.brake_radps2 \(=2\)"):
-            joint.move_to(0.69, duration_s=0.95)
-        joint.move_to(0.69, duration_s=2.0)
-        assert joint.state.position_rad == pytest.approx(0.69, abs=1e-3)
+    joint.move_to(0.19)
+    with pytest.raises(ConfigurationError, match=r"would come to rest at .* sequence.brake_radps2 \(=2\)"):
+        joint.move_to(0.69, duration_s=0.95)
+    joint.move_to(0.69, duration_s=2.0)
+    assert joint.state.position_rad == pytest.approx(0.69, abs=1e-3)
 
 
 def test_it_is_commissioned_then_enabled_then_moves_and_is_off_afterwards() -> None:
@@ -130,22 +128,19 @@ def test_a_set_point_that_breaks_a_limit_is_refused_and_changes_nothing(
     joint.step(0.1)
 
 
-def test_times_must_ascend_without_a_gap(joint: Joint) -> None:
+@pytest.mark.parametrize(
+    ("time_s", "words"),
+    [
+        *((time_s, "after the set-point before") for time_s in (7.0, 6.9, 7.5, 4e9)),
+        *((time_s, r"time_s .* must be in \[-4e\+09..4e\+09\]") for time_s in (math.nan, math.inf, 1e12, -1e300)),
+        ("7.01", "made of numbers"),
+    ],
+)
+def test_times_must_be_numbers_that_ascend_without_a_gap(joint: Joint, time_s: float, words: str) -> None:
     at_rad = joint.state.desired_position_rad
     joint.command(at_rad, 0.0, time_s=7.0)
     joint.step(0.01)
-    for time_s in (7.0, 6.9, 7.5, 4e9):
-        with pytest.raises(SetPointError, match="after the set-point before"):
-            joint.command(at_rad, 0.0, time_s=time_s)
-    joint.command(at_rad, 0.0, time_s=7.01)
-
-
-@pytest.mark.parametrize("time_s", [math.nan, math.inf, 1e12, -1e300, "7.01"])
-def test_a_time_that_is_none_refuses_the_set_point(joint: Joint, time_s: float) -> None:
-    at_rad = joint.state.desired_position_rad
-    joint.command(at_rad, 0.0, time_s=7.0)
-    joint.step(0.01)
-    with pytest.raises(SetPointError, match=r"time_s .* must be in \[-4e\+09..4e\+09\]|made of numbers"):
+    with pytest.raises(SetPointError, match=words):
         joint.command(at_rad, 0.0, time_s=time_s)
     joint.command(at_rad, 0.0, time_s=7.01)
 
@@ -257,71 +252,37 @@ def test_nothing_enables_twice_and_nothing_moves_after_a_stop(joint: Joint) -> N
         joint.enable()
 
 
-def pushed_for_ever() -> None:
-    with Joint("virtual", lockstep=True) as joint:
-        joint.enable()
-        joint.step_torque(40.0)
-        joint.wait(1e300)
-
-
-def test_a_wait_without_end_ends_with_the_run() -> None:
-    with pytest.raises(jointctl.MotionFault, match="VELOCITY_LIMIT"):
-        pushed_for_ever()
-
-
-def pushed() -> None:
-    with Joint("virtual", lockstep=True) as joint:
+@pytest.mark.parametrize("wait_s", [0.001, 1e300])
+def test_a_fault_is_raised_with_its_cause_however_long_is_waited(wait_s: float) -> None:
+    fault = pytest.raises(jointctl.MotionFault, match=r"(POSITION|VELOCITY)_LIMIT")
+    with fault, Joint("virtual", lockstep=True) as joint:
         joint.enable()
         for _ in range(3000):
             joint.step_torque(40.0)
-            joint.wait(0.001)
+            joint.wait(wait_s)
 
 
-def test_a_fault_is_raised_with_its_cause() -> None:
-    with pytest.raises(jointctl.MotionFault, match=r"(POSITION|VELOCITY)_LIMIT"):
-        pushed()
+def test_a_law_in_python_holds_the_joint(joint: Joint) -> None:
+    state, target_rad = joint.state, joint.state.position_rad + 0.02
+    for _ in range(2000):
+        state = joint.step_torque(8000.0 * (target_rad - state.position_rad) - 300.0 * state.velocity_radps)
+    assert abs(state.position_rad - target_rad) < 5e-3
 
 
-def test_it_is_deterministic() -> None:
-    logs = []
-    for _ in range(2):
-        with Joint("virtual", lockstep=True) as joint:
-            joint.enable()
-            streamed(joint, 1.0)
-        logs.append(joint.records)
-    assert (logs[0] == logs[1]).all()
+def test_after_a_torque_of_ones_own_no_motion_is_promised(joint: Joint) -> None:
+    joint.step_torque(0.0)
+    at_rad = joint.state.desired_position_rad
+    for move in (lambda: joint.move_to(0.3), lambda: joint.follow([0.0, 1.0], [0.1, 0.2]), lambda: joint.command(0.1)):
+        with pytest.raises(jointctl.UsageError, match="no motion or set-point would be followed"):
+            move()
+    joint.wait(0.1)  # with the last torque
+    assert joint.state.desired_position_rad == at_rad
 
 
-def test_a_law_in_python_holds_the_joint() -> None:
-    with Joint("virtual", lockstep=True) as joint:
-        joint.enable()
-        state, target_rad = joint.state, joint.state.position_rad + 0.02
-        for _ in range(2000):
-            state = joint.step_torque(8000.0 * (target_rad - state.position_rad) - 300.0 * state.velocity_radps)
-        assert abs(state.position_rad - target_rad) < 5e-3
-
-
-def test_after_a_torque_of_ones_own_no_motion_is_promised() -> None:
-    with Joint("virtual", lockstep=True) as joint:
-        joint.enable()
-        joint.step_torque(0.0)
-        at_rad = joint.state.desired_position_rad
-        for move in (
-            lambda: joint.move_to(0.3),
-            lambda: joint.follow([0.0, 1.0], [0.1, 0.2]),
-            lambda: joint.command(0.1),
-        ):
-            with pytest.raises(jointctl.UsageError, match="no motion or set-point would be followed"):
-                move()
-        joint.wait(0.1)  # with the last torque
-        assert joint.state.desired_position_rad == at_rad
-
-
-def test_a_stop_takes_the_torque_of_ones_own_law_away() -> None:
-    with Joint("virtual", lockstep=True) as joint:
-        joint.enable()
-        for _ in range(60):
-            joint.step_torque(30.0)
+def test_a_stop_takes_the_torque_of_ones_own_law_away(joint: Joint) -> None:
+    for _ in range(60):
+        joint.step_torque(30.0)
+    joint.stop()
     assert (joint.state.phase, joint.state.fault) == ("finished", "")
 
 

@@ -36,11 +36,7 @@ from jointctl.drivers.canopen.cyclic import (
     answer_owed,
     begin_cycle,
     end_cycle,
-    get_i16,
-    get_i32,
-    get_u16,
     note_wake,
-    put_u16,
     torque_permille,
 )
 from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
@@ -407,22 +403,6 @@ def test_bus_load_counts_both_directions_at_worst_stuffing(wire: Wire) -> None:
     wire.port.cycle = 0
     begin_cycle(wire.port, wire.frames)  # SYNC 55 and heartbeat 65
     assert wire.port.bits_sent == 285 + 55 + 65
-
-
-@given(data=st.binary(min_size=8, max_size=8))
-def test_integers_are_little_endian(data: bytes) -> None:
-    array = np.frombuffer(data, np.uint8)
-    assert get_u16(array, 1) == struct.unpack_from("<H", data, 1)[0]
-    assert get_i16(array, 3) == struct.unpack_from("<h", data, 3)[0]
-    assert get_i32(array, 4) == struct.unpack_from("<i", data, 4)[0]
-
-
-@given(value=st.integers(-32768, 65535))
-def test_put_is_the_inverse_of_get(value: int) -> None:
-    array = np.zeros(4, np.uint8)
-    put_u16(array, 1, value)
-    assert get_u16(array, 1) == value % 65536
-    assert (array[0], array[3]) == (0, 0)
 
 
 # --- A TPDO that repeats or delays an old value is not taken for a new sample ---
