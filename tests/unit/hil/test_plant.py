@@ -62,13 +62,9 @@ def test_load_opposes_positive_motion_and_steps_at_its_time():
     assert s[0].load_torque_Nm == 4.0
     run(c[0], s[0], 1.0, 199)
     assert s[0].joint_velocity_radps == pytest.approx(-3.0 / 2.1 * 0.01, rel=1e-9)
-
-
-def test_load_added_from_outside_acts():
-    c, s = plant()
-    s[0].added_load_torque_Nm = 2.1
-    run(c[0], s[0], 0.0, 100)
-    assert s[0].joint_velocity_radps == pytest.approx(-0.005, rel=1e-9)
+    s[0].added_load_torque_Nm = 2.1  # from outside
+    run(c[0], s[0], 4.0, 100)
+    assert s[0].joint_velocity_radps == pytest.approx(-3.0 / 2.1 * 0.01 - 0.005, rel=1e-9)
 
 
 def test_gravity_pendulum_keeps_its_energy_and_period():
@@ -112,14 +108,6 @@ def test_flexible_joint_rings_at_its_free_free_frequency(stiffness):
     assert_rings(c, s, 0.0, 0.0, stiffness)
     momentum = 1.2 * s[0].motor_velocity_radps + 0.9 * s[0].joint_velocity_radps
     assert momentum == pytest.approx(0.0, abs=1e-12)
-
-
-def test_reducer_damping_takes_energy_and_static_twist_is_torque_over_stiffness():
-    c, s = plant(flexible=True, reducer_stiffness_Nmprad=1e4, reducer_damping_Nmspr=20.0)
-    s[0].added_load_torque_Nm = 10.0
-    run(c[0], s[0], 10.0, 40000)
-    assert s[0].motor_position_rad - s[0].joint_position_rad == pytest.approx(1e-3, rel=1e-6)
-    assert s[0].reducer_torque_Nm == pytest.approx(10.0, rel=1e-6)
 
 
 def test_end_stop_holds_the_joint_and_its_twin_without_stops_passes():

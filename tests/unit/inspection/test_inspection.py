@@ -164,16 +164,12 @@ class TestInfo:
         assert re.search(r"polarity +C0h inverts positions, velocities", out.getvalue())
 
     def test_without_an_eds_the_standard_names_do(self, joint: Any) -> None:
-        told, out, _ = output()
-        assert info(subject(joint), told) == 0
-        assert "Max torque" in out.getvalue()
-        assert "6041 Statusword (16 bit)" in out.getvalue()
-
-    def test_the_heartbeats_that_it_watches(self, joint: Any) -> None:
         joint.device.objects.store(0x1016, 1, (126 << 16 | 200).to_bytes(4, "little"))
         told, out, _ = output()
         assert info(subject(joint), told) == 0
         assert re.search(r"watched heartbeats +node 126, 200 ms", out.getvalue())
+        assert "Max torque" in out.getvalue()
+        assert "6041 Statusword (16 bit)" in out.getvalue()
 
     def test_the_error_history(self, joint: Any) -> None:
         joint.stop()

@@ -348,25 +348,24 @@ def test_the_server_repeats_its_count_also_during_a_reload(
     assert len(told) >= 3
 
 
-@pytest.mark.parametrize("in_charge", [True, False])
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"in_charge": True}, "server has ended: no page shows"),
+        ({"in_charge": False}, "server has ended: no page shows"),
+        ({"server": "Foxglove", "takes": frozenset()}, "Foxglove's server has ended: no client there shows"),
+    ],
+)
 def test_the_end_of_the_server_brakes_what_is_led_from_the_page(
-    ends: tuple[socket.socket, socket.socket], in_charge: bool
+    ends: tuple[socket.socket, socket.socket], how: dict[str, Any], words: str
 ) -> None:
-    feed = ScopeFeed(ends[0], in_charge=in_charge)
+    feed = ScopeFeed(ends[0], **how)
     assert feed.stop_request() is StopRequest.NONE
     ends[1].close()
-    assert feed.stop_request() is (StopRequest.RAMP if in_charge else StopRequest.NONE)
+    assert feed.stop_request() is (StopRequest.RAMP if how.get("in_charge") else StopRequest.NONE)
     (told,) = feed.requests()
-    assert "server has ended: no page shows" in told.values["text"]
+    assert words in told.values["text"]
     assert feed.requests() == []
-
-
-def test_the_end_of_another_server_is_not_called_that_of_a_page(ends: tuple[socket.socket, socket.socket]) -> None:
-    feed = ScopeFeed(ends[0], server="Foxglove", takes=frozenset())
-    ends[1].close()
-    feed.stop_request()
-    (told,) = feed.requests()
-    assert "Foxglove's server has ended: no client there shows" in told.values["text"]
 
 
 def test_nobody_watching_is_an_event_and_a_line_in_the_terminal(tmp_path: Path) -> None:

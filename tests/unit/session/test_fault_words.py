@@ -249,19 +249,23 @@ def told(fault: Fault, value: float, records: Any) -> bool:
     return text != TEXT
 
 
-@pytest.mark.parametrize(("skipped", "expected"), [(19, True), (10, True), (9, False)])
-def test_a_pause_of_half_the_time_without_samples_is_told(skipped: int, expected: bool) -> None:
-    assert told(Fault.STALE_SAMPLE, 20.0, paused_records(skipped=(FAULTY, skipped))) is expected
-
-
-@pytest.mark.parametrize("field", ["round_trip_ns", "wake_late_ns", "work_ns"])
-@pytest.mark.parametrize(("pause_ns", "expected"), [(24_100_000, True), (23_900_000, False)])
-def test_a_long_cycle_before_a_leap_is_told(field: str, pause_ns: int, expected: bool) -> None:
-    assert told(Fault.VELOCITY_LIMIT, 1.9, paused_records(Fault.VELOCITY_LIMIT, **{field: (178, pause_ns)})) is expected
-
-
-def test_a_loop_that_swings_on_a_late_computer_is_not_blamed_on_its_gains_alone() -> None:
-    assert told(Fault.LIMIT_CYCLE, 9.0, paused_records(Fault.LIMIT_CYCLE, skipped=(FAULTY, 4)))
+@pytest.mark.parametrize(
+    ("fault", "value", "field", "index", "paused", "expected"),
+    [
+        *((Fault.STALE_SAMPLE, 20.0, "skipped", FAULTY, cycles, cycles >= 10) for cycles in (19, 10, 9)),
+        *((Fault.VELOCITY_LIMIT, 1.9, field, 178, pause_ns, pause_ns > 24_000_000)
+          for field in ("round_trip_ns", "wake_late_ns", "work_ns") for pause_ns in (24_100_000, 23_900_000)),
+        # only one just before counts
+        *((Fault.VELOCITY_LIMIT, 1.9, "skipped", index, 40, index in (118, FAULTY))
+          for index in (117, 118, FAULTY, FAULTY + 1)),
+        (Fault.LIMIT_CYCLE, 9.0, "skipped", FAULTY, 4, True),  # not to be laid to the gains alone
+        (Fault.POSITION_DISAGREEMENT, 0.1, "skipped", FAULTY, 90, False),  # no pause causes it
+    ],
+)  # fmt: skip
+def test_a_pause_that_may_have_caused_it_is_told(
+    fault: Fault, value: float, field: str, index: int, paused: int, expected: bool
+) -> None:
+    assert told(fault, value, paused_records(fault, **{field: (index, paused)})) is expected
 
 
 def test_at_a_high_rate_three_cycles_are_no_pause() -> None:
@@ -271,20 +275,11 @@ def test_at_a_high_rate_three_cycles_are_no_pause() -> None:
     assert "for 5 ms" in held_up_text(Fault.VELOCITY_LIMIT, 1.9, TEXT, records, 1000.0).happened
 
 
-@pytest.mark.parametrize(("index", "expected"), [(117, False), (118, True), (FAULTY, True), (FAULTY + 1, False)])
-def test_only_a_pause_just_before_counts(index: int, expected: bool) -> None:
-    assert told(Fault.VELOCITY_LIMIT, 1.9, paused_records(Fault.VELOCITY_LIMIT, skipped=(index, 40))) is expected
-
-
 def test_the_text_keeps_the_other_cause_and_what_to_do() -> None:
     text = held_up_text(Fault.STALE_SAMPLE, 20.0, TEXT, paused_records(skipped=(FAULTY, 19)), RATE_Hz)
     assert text.happened == "it happened, after the loop had been held up for 152 ms"
     assert text.cause.endswith("if that pause was not the cause, the cable")
     assert text.next_step == "run `jointctl doctor`; check it"
-
-
-def test_faults_that_no_pause_causes_are_left_alone() -> None:
-    assert not told(Fault.POSITION_DISAGREEMENT, 0.1, paused_records(Fault.POSITION_DISAGREEMENT, skipped=(FAULTY, 90)))
     assert longest_pause_s(paused_records(Fault.NONE, skipped=(FAULTY, 90)), 0.008) == 0.0
 
 

@@ -90,23 +90,23 @@ OWN_LOOP: dict[str, Any] = {"mode": "csp", "holds_alone": True, "torque_offset":
 
 
 @pytest.mark.parametrize(
-    ("index", "words"),
-    [(0x6007, "object 6007 .* dies, in mode csp it may go on holding or turning"), (0x60B2, "object 60B2 .*offset")],
-)
-def test_a_drive_that_lacks_what_a_loop_of_its_own_needs_is_refused(lacking: Any, index: int, words: str) -> None:
+    ("index", "how", "words"),
+    [
+        (0x60B2, OWN_LOOP, "object 60B2 .*offset"),
+        # a sweep used such a drive: with the computer dead one that merely leaves operational may go on turning
+        *((0x6007, how, f"object 6007 .* dies, in mode {how['mode']} it may go on holding or turning")
+          for how in (OWN_LOOP, {"mode": "csv"}, {"mode": "pv"})),
+    ],
+)  # fmt: skip
+def test_a_drive_that_lacks_what_a_loop_of_its_own_needs_is_refused(
+    lacking: Any, index: int, how: dict[str, Any], words: str
+) -> None:
     with pytest.raises(DeviceError, match=words):
-        lacking((index, None), **OWN_LOOP)
+        lacking((index, None), **how)
 
 
 def test_its_twin_in_torque_mode_the_same_drive_is_accepted(lacking: Any) -> None:
     assert lacking((0x6007, None), (0x60B2, None)).mode == "cyclic_sync_torque"
-
-
-@pytest.mark.parametrize("mode", ["csv", "pv"])
-def test_nor_is_it_used_in_a_velocity_mode_for_a_sweep(lacking: Any, mode: str) -> None:
-    """It was: with the computer dead a drive that merely leaves operational may go on turning."""
-    with pytest.raises(DeviceError, match=f"object 6007 .* in mode {mode} it may go on holding or turning"):
-        lacking((0x6007, None), mode=mode)
 
 
 @pytest.mark.parametrize("without", [0x6007, 0x60B2])
@@ -124,10 +124,12 @@ def test_without_60b1_6065_and_a_torque_mode_csp_goes_on_with_remarks(lacking: A
         assert any(f"no object {index}" in remark for remark in remarks)
 
 
-def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
-    report = lacking((0x6087, None), (0x60C2, None), mode="tq")
+@pytest.mark.parametrize("sub", [None, 1, 2])
+def test_a_profile_mode_does_without_slope_and_period_or_half_of_it(lacking: Any, joint: Any, sub: int | None) -> None:
+    report = lacking((0x6087, None), (0x60C2, sub), mode="tq")
     assert any("no object 6087" in line for line in report.remarks)
     assert "60C2" not in report.settings
+    assert not any(joint.downloads(0x60C2, left) for left in (1, 2))
 
 
 @pytest.mark.parametrize("sub", [1, 2])
@@ -196,12 +198,6 @@ def test_a_drive_that_does_not_tell_its_scale_is_commissioned_with_a_remark(comm
     remarks = commission(eds=EDS.read_text() + SCALED, mode="cst").remarks
     told = "\n".join(remarks)
     assert all(re.search(rf"6064 is not known: .*{index}.* was refused", told) for index in ("6091", "6092")), told
-
-
-@pytest.mark.parametrize("sub", [1, 2])
-def test_a_profile_mode_does_without_half_a_period(lacking: Any, joint: Any, sub: int) -> None:
-    assert "60C2" not in lacking((0x60C2, sub), mode="tq").settings
-    assert not joint.downloads(0x60C2, 3 - sub)
 
 
 @pytest.mark.parametrize(
