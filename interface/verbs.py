@@ -173,8 +173,9 @@ def identify(
     `table` says how to read a table that is not ours (fields of `ForeignFormat`), `options` are fields of `Options`;
     with `config` torque and speed are checked for plausibility.
     """
-    from jointctl.tools.identification.friction_data import ForeignFormat, read_friction_data
+    from jointctl.tools.identification.friction_data import read_friction_data
     from jointctl.tools.identification.identification import Options, identify_friction
+    from jointctl.tools.identification.tables import ForeignFormat
     from jointctl.tools.verbs.identify import joint_limits
     from jointctl.tools.verbs.verb_options import config_path
 
@@ -189,8 +190,8 @@ def identify_motion(data: str | Path, *, table: dict[str, Any] | None = None, **
     `table` says how to read a table (fields of `ForeignFormat`), `settings` are fields of `MotionSettings`.
     """
     from jointctl.tools.identification import motion_fit
-    from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.motion_data import MotionSettings
+    from jointctl.tools.identification.tables import ForeignFormat
     from jointctl.tools.verbs.identify import motion_from
 
     chosen = _made(MotionSettings, "identify_motion", settings)

@@ -25,11 +25,11 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import Friction, FrictionAngle, Ripple
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.models import ORDERS
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.motion_fit import MotionFit, identify_motion
 from jointctl.tools.identification.motion_report import motion_section
+from jointctl.tools.identification.tables import ForeignFormat
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import config_of_sweep
 from jointctl.tools.sweeping.excitation import Design, designed

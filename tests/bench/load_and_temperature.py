@@ -30,10 +30,10 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import Friction, FrictionLoad, FrictionTemperature
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.motion_fit import identify_motion
 from jointctl.tools.identification.motion_report import motion_section
+from jointctl.tools.identification.tables import ForeignFormat
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent

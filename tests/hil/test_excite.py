@@ -11,9 +11,9 @@ import pytest
 
 from jointctl.drivers.errors import UsageError
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.motion_fit import identify_motion
+from jointctl.tools.identification.tables import ForeignFormat
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.excite import ExciteOptions, excite
 from jointctl.tools.verbs.identify import motion_from

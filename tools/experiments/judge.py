@@ -141,16 +141,13 @@ def load_Nm(config: Config) -> float:
     return abs(virtual.gravity_Nm) + abs(virtual.load_torque_Nm) + abs(virtual.load_step_Nm)
 
 
-def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
+def _friction_floor_Nm(config: Config, positive_scale: float, negative_scale: float) -> float:
     """The least Coulomb friction at the joint, of the slower direction and with its ripple."""
     virtual = config.virtual
     assert virtual is not None
     friction = virtual.friction or config.friction
     assert friction is not None
-    curves = (
-        abs(friction.positive.tc_Nm) * scenario.plant["friction_positive_scale"],
-        abs(friction.negative.tc_Nm) * scenario.plant["friction_negative_scale"],
-    )
+    curves = abs(friction.positive.tc_Nm) * positive_scale, abs(friction.negative.tc_Nm) * negative_scale
     return config.joint.reduction_ratio * min(curves) * (1.0 - virtual.friction_ripple)
 
 
@@ -175,7 +172,8 @@ def envelope(
     load = magnitude_of(events, FaultKind.LOAD_JUMP)
     drive_Nm = largest_drive_Nm(config)
     constant_Nm = load_Nm(config)
-    floor = _friction_floor_Nm(config, scenario) - ripple - constant_Nm
+    scales = (scenario.plant[f"friction_{side}_scale"] for side in ("positive", "negative"))
+    floor = _friction_floor_Nm(config, *scales) - ripple - constant_Nm
     wait_s = reaction_s(config, events)
     push = (drive_Nm + ripple + load + constant_Nm) / inertia
     speed = limits.velocity_max_radps + push * wait_s
@@ -257,12 +255,7 @@ def require_joint_fits(config: Config, torque_Nm: float = 0.0) -> None:
 
 def friction_floor_Nm(config: Config) -> float:
     """The least Coulomb friction at the joint of all scenarios."""
-    virtual = config.virtual
-    assert virtual is not None
-    friction = virtual.friction or config.friction
-    assert friction is not None
-    weakest_Nm = config.joint.reduction_ratio * min(abs(friction.positive.tc_Nm), abs(friction.negative.tc_Nm))
-    return LEAST_SCALE * weakest_Nm * (1.0 - virtual.friction_ripple)
+    return _friction_floor_Nm(config, LEAST_SCALE, LEAST_SCALE)
 
 
 def require_fit(config: Config) -> None:

@@ -33,7 +33,7 @@ import numpy as np
 from jointctl.drivers.errors import DataError, TooFewPoints, UsageError
 from jointctl.firmware_py.input_file import number_from, parse_json
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
-from jointctl.tools.identification.tables import TableFile, read_bytes, read_table
+from jointctl.tools.identification.tables import ForeignFormat, TableFile, read_bytes, read_table
 
 # --- the points, and which of them are used ---
 
@@ -161,49 +161,12 @@ _UNIT_NAMES = {  # how else headings write a unit, in lower case
 REVERSIBLE = ("position", "velocity", "torque", "load")
 
 
-@dataclass(frozen=True)
-class ForeignFormat:
-    """How to read a table that is not ours; None = not given."""
-
-    velocity_column: str | None = None
-    torque_column: str | None = None
-    current_column: str | None = None
-    velocity_unit: str | None = None
-    side: str | None = None  # of velocity and position
-    torque_side: str | None = None
-    ratio: float | None = None
-    torque_constant_NmpA: float | None = None
-    delimiter: str = "auto"
-    torque_unit: str = "Nm"
-    current_unit: str = "A"
-    counts_per_turn: float | None = None  # of the shaft on whose side the counts are
-    reverse: Sequence[str] = ()  # of REVERSIBLE: columns whose sign is the other way round
-    where: Sequence[str] = ()  # COLUMN=VALUE: lines that are used
-    # of a time series
-    time_column: str | None = None
-    time_unit: str = "s"
-    sample_rate_Hz: float | None = None  # takes the place of the time's column
-    position_column: str | None = None
-    position_unit: str | None = None
-    position_side: str | None = None  # None: that of the velocity
-    load_column: str | None = None  # torque at the joint that the load is known to need [Nm]
-    temperature_column: str | None = None
-    temperature_unit: str = "degC"
-    motion_column: str | None = None  # where it changes another motion begins; if it is that of the time: goes back
-
-    @property
-    def mapped(self) -> bool:
-        return bool(self.velocity_column or self.torque_column or self.current_column)
-
-    def sign(self, name: str) -> float:
-        return -1.0 if name in self.reverse else 1.0
-
-    def rad_per_unit(self, unit: str) -> float:
-        """Radians, or rad/s, of the shaft."""
-        if unit in ("count", "count/s"):
-            assert self.counts_per_turn is not None
-            return math.tau / self.counts_per_turn
-        return {**RAD_PER_UNIT, **VELOCITY_UNITS}[unit]
+def rad_per_unit(given: ForeignFormat, unit: str) -> float:
+    """Radians, or rad/s, of the shaft."""
+    if unit in ("count", "count/s"):
+        assert given.counts_per_turn is not None
+        return math.tau / given.counts_per_turn
+    return {**RAD_PER_UNIT, **VELOCITY_UNITS}[unit]
 
 
 def check_given(given: ForeignFormat) -> None:
@@ -218,7 +181,7 @@ def check_given(given: ForeignFormat) -> None:
         ("--torque-unit", given.torque_unit, tuple(Nm_PER_UNIT)),
         ("--current-unit", given.current_unit, tuple(A_PER_UNIT)),
         ("--temperature-unit", given.temperature_unit, tuple(DEGC_OF_UNIT)),
-        *(("--reverse", each, REVERSIBLE) for each in given.reverse),
+        *(("--reverse", each, REVERSIBLE) for each in given.reverse or ()),
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
@@ -273,7 +236,7 @@ def refuse_unused_format(given: ForeignFormat, *, timed: bool) -> None:
     if any(str(getattr(given, unit)).startswith("count") for unit in units):
         used.add("counts_per_turn")
     signed = {*(name for name in ("position", "velocity", "load") if there[name]), "torque"}
-    if signed.issuperset(given.reverse):
+    if signed.issuperset(given.reverse or ()):
         used.add("reverse")
     what = "a motion in time" if timed else "plateaus"
     refuse_unused(given, used, f"{what} with the columns that were given")
@@ -316,7 +279,7 @@ def require_units_of_heading(table: TableFile, given: ForeignFormat) -> None:
 
 def chosen_lines(table: TableFile, given: ForeignFormat) -> TableFile:
     """The lines for which each COLUMN=VALUE of `--where` holds, as text or as a number."""
-    for rule in given.where:
+    for rule in given.where or ():
         name, equals, wanted = rule.partition("=")
         if not equals:
             raise UsageError(f"--where (={rule}) must be COLUMN=VALUE")
@@ -342,7 +305,7 @@ def velocity_radps(table: TableFile, given: ForeignFormat, *, gaps: bool = False
     assert given.velocity_column is not None
     assert given.velocity_unit is not None
     assert given.ratio is not None
-    scale = given.rad_per_unit(given.velocity_unit) / (given.ratio if given.side == "motor" else 1.0)
+    scale = rad_per_unit(given, given.velocity_unit) / (given.ratio if given.side == "motor" else 1.0)
     return table.numbers(given.velocity_column, gaps=gaps) * scale * given.sign("velocity")
 
 

@@ -27,12 +27,11 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.identification.friction_data import (
     MIN_PER_DIRECTION,
     OF_SWEEP,
-    ForeignFormat,
     check_given,
     read_sidecar,
     refuse_unused,
 )
-from jointctl.tools.identification.tables import read_table
+from jointctl.tools.identification.tables import ForeignFormat, read_table
 
 BAND_Hz, BAND_SHARE = 20.0, 0.2  # default: at most this share of the rate; with a running mean its first zero
 LEAST_SAMPLES = 200
@@ -200,9 +199,9 @@ class RawMotion:
 # --- reading ---
 
 
-def is_series(path: Path, given: ForeignFormat | None) -> bool:
+def is_series(path: Path, given: ForeignFormat) -> bool:
     """Whether a file holds a time series: a run log, or a table whose column of time or rate the user gives."""
-    timed = given is not None and (given.time_column is not None or given.sample_rate_Hz is not None)
+    timed = given.time_column is not None or given.sample_rate_Hz is not None
     return path.suffix.lower() == ".mcap" or timed
 
 

@@ -19,10 +19,10 @@ from jointctl.drivers.errors import DataError, UsageError
 from jointctl.tools.identification.friction_data import (
     DEGC_OF_UNIT,
     SECONDS_PER_UNIT,
-    ForeignFormat,
     check_given,
     chosen_lines,
     motor_torque_Nm,
+    rad_per_unit,
     refuse_unused_format,
     require_stated,
     require_units_of_heading,
@@ -39,7 +39,7 @@ from jointctl.tools.identification.motion_data import (
     prepared_motion,
     require_motion,
 )
-from jointctl.tools.identification.tables import TableFile, read_table
+from jointctl.tools.identification.tables import ForeignFormat, TableFile, read_table
 
 _JUMP = 0.5  # of a period from one sample to the next: the angle has begun anew
 _COUNTER_BITS = (16, 32)
@@ -117,7 +117,7 @@ def _series(table: TableFile, given: ForeignFormat) -> RawMotion:
     if given.position_column:
         assert given.position_unit is not None
         names["position"] = given.position_column
-        turns = table.numbers(given.position_column, gaps=True) * given.rad_per_unit(given.position_unit) / math.tau
+        turns = table.numbers(given.position_column, gaps=True) * rad_per_unit(given, given.position_unit) / math.tau
         to_joint = math.tau / (ratio if (given.position_side or given.side) == "motor" else 1.0)
         raw.position_rad = _unwrapped(turns, given, raw) * to_joint * given.sign("position")
     if given.velocity_column:

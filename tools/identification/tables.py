@@ -3,7 +3,7 @@
 Delimiter (; tab , space), decimal comma, byte-order mark, comments (#), quotes, lines above the header, a line of units
 below it and a delimiter at the end of each line are recognised; what the columns mean is not.  Columns are parsed when
 they are asked for, by numpy where they hold nothing but numbers.  Every problem is one `DataError` with file, line and
-value.
+value.  `--help` loads this: numpy is loaded once there is something to read.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import typer
 
 from jointctl.drivers.errors import DataError, UsageError
 from jointctl.firmware_py.input_file import LARGEST_SERIES_BYTES, number_from, read_input
+
+if TYPE_CHECKING:
+    import numpy as np
 
 DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
 LARGEST_NUMBER = 1e100  # whatever it means, its squares are numbers as well
@@ -32,6 +36,69 @@ _TWO_NUMBERS = re.compile(r"[0-9]+[ \t]+[+-]?[0-9]+")  # what a comma leaves of 
 _UNIT_BEHIND = re.compile(r"\s*(?:\[([^]]*)\]|\(([^)]*)\))$")
 _TIMESTAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?\s?(Z|UTC|[+-]\d\d:?\d\d)?")
 _WITH_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class ForeignFormat:
+    """How to read a table that is not ours, and the options for that; None = not given."""
+
+    velocity_column: Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")] = None
+    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column")] = None
+    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column")] = None
+    velocity_unit: Annotated[
+        str | None, typer.Option("--velocity-unit", help="deg/s, rad/s, r/min, turn/s or count/s")
+    ] = None
+    side: Annotated[str | None, typer.Option("--side", help="of velocity and position: joint or motor")] = None
+    torque_side: Annotated[str | None, typer.Option("--torque-side", help="motor or joint")] = None
+    torque_unit: Annotated[str, typer.Option("--torque-unit", help="Nm, Ncm or mNm")] = "Nm"
+    current_unit: Annotated[str, typer.Option("--current-unit", help="A or mA")] = "A"
+    ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
+    torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
+    counts_per_turn: Annotated[
+        float | None, typer.Option("--counts-per-turn", help="of the shaft that is counted, for the unit count")
+    ] = None
+    reverse: Annotated[
+        list[str] | None,
+        typer.Option("--reverse", help="position, velocity, torque or load: the other sign; may be repeated"),
+    ] = None
+    where: Annotated[
+        list[str] | None,
+        typer.Option("--where", metavar="COLUMN=VALUE", help="only such lines, as of one joint; may be repeated"),
+    ] = None
+    delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
+    time_column: Annotated[
+        str | None, typer.Option("--time-column", help="name of the time column: the table is a motion in time")
+    ] = None
+    time_unit: Annotated[str, typer.Option("--time-unit", help="s, ms, us or ns")] = "s"
+    sample_rate_Hz: Annotated[
+        float | None, typer.Option("--sample-rate", help="samples a second, in place of a column of time")
+    ] = None
+    motion_column: Annotated[
+        str | None,
+        typer.Option("--motion-column", help="column that changes from one motion to the next, or time that goes back"),
+    ] = None
+    position_column: Annotated[str | None, typer.Option("--position-column", help="name of the position column")] = None
+    position_unit: Annotated[str | None, typer.Option("--position-unit", help="rad, deg, turn or count")] = None
+    position_side: Annotated[
+        str | None, typer.Option("--position-side", help="where it is not that of the velocity: joint or motor")
+    ] = None
+    load_column: Annotated[
+        str | None, typer.Option("--load-column", help="name of the column of the known load's torque (joint, Nm)")
+    ] = None
+    temperature_column: Annotated[
+        str | None, typer.Option("--temperature-column", help="name of the temperature column")
+    ] = None
+    temperature_unit: Annotated[str, typer.Option("--temperature-unit", help="degC, K or degF")] = "degC"
+
+    @property
+    def mapped(self) -> bool:
+        return bool(self.velocity_column or self.torque_column or self.current_column)
+
+    def sign(self, name: str) -> float:
+        return -1.0 if name in (self.reverse or ()) else 1.0
+
+
+OURS = ForeignFormat()  # nothing is given
 
 
 @dataclass(frozen=True)
@@ -83,6 +150,8 @@ class TableFile:
 
     def timestamps_s(self, name: str) -> np.ndarray | None:
         """Seconds (N,) since the first of a column of ISO 8601 or of times of day; None where the first is no such."""
+        import numpy as np
+
         index = self.column(name)
         cells = [split(line, self.mark)[index] for line in self.lines]
         if not cells or not _TIMESTAMP.fullmatch(cells[0]):
@@ -134,6 +203,8 @@ class TableFile:
 
         `DataError` names the line of anything else.
         """
+        import numpy as np
+
         index = self.column(name)
         fast = self._at_once(index)
         if fast is not None and ((np.abs(fast) <= LARGEST_NUMBER) | (np.isnan(fast) & gaps)).all():
@@ -147,6 +218,8 @@ class TableFile:
 
     def _at_once(self, index: int) -> np.ndarray | None:
         """The column by numpy's own parser; None where that meets anything but numbers."""
+        import numpy as np
+
         lines: Sequence[str] = self.lines
         if self.decimal_comma:
             lines = [line.replace(",", ".") for line in lines]
@@ -241,6 +314,8 @@ def _is_number(text: str) -> bool:
 
 def read_table(path: Path, delimiter: str = "auto") -> TableFile:
     """Header and lines; comments and empty lines are skipped, and what stands above the header."""
+    import numpy as np
+
     content = read_bytes(path)
     text, wrong_byte = _text(path, content)
     lines = [

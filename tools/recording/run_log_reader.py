@@ -70,14 +70,7 @@ class RunLog:
             import pandas
         except ModuleNotFoundError:
             raise DataError("pandas is not installed", "python -m pip install pandas") from None
-        columns: dict[str, np.ndarray] = {}
-        for name in self.records.dtype.names:
-            values = np.asarray(self.records[name])
-            if values.ndim == 1:
-                columns[name] = values
-            else:
-                columns |= {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
-        return pandas.DataFrame(columns)
+        return pandas.DataFrame(columns(self.records))
 
 
 def read_run_log(path: str | Path) -> RunLog:

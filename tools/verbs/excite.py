@@ -70,10 +70,10 @@ def excite(
     save_png(excitation_figure(design, f"{config.path.stem}: motion of {design.motion.duration_s:.0f} s"), picture)
     output.note(f"written: {picture}")
     _show(design, output)
-    how = {
-        "assume_yes": assume_yes or options.lockstep, "dry_run": dry_run, "allow_low_margin": allow_low_margin,
-    }  # fmt: skip
-    log = (_lockstep if options.lockstep else _measured)(moving, ExcitePass(moving, design), output, **how)
+    log = _log_of(
+        moving, ExcitePass(moving, design), output, lockstep=options.lockstep, allow_low_margin=allow_low_margin,
+        assume_yes=assume_yes or options.lockstep, dry_run=dry_run,
+    )  # fmt: skip
     if isinstance(log, int):
         return log
     found = ExciteResult(str(log), 0.8 * design.slowest_radps, design.condition, design.known, design.untold)
@@ -94,21 +94,18 @@ def _show(design: Design, output: Output) -> None:
         output.fact(f"open       {line}")
 
 
-def _measured(config: Config, motion: Motion, output: Output, *, allow_low_margin: bool, **how: bool) -> Path | int:
+def _log_of(
+    config: Config, motion: Motion, output: Output, *, lockstep: bool, allow_low_margin: bool, **how: bool
+) -> Path | int:
+    """The run log of the motion, or the exit code without one."""
     from jointctl.tools.recording.run_log import log_path
-    from jointctl.tools.session.plan import RunPlan
-    from jointctl.tools.sweeping.carry_out import carried_out
+    from jointctl.tools.session.plan import RunPlan, TerminalConsent
+    from jointctl.tools.sweeping.carry_out import carried_out, lockstep_log
 
-    result = carried_out(RunPlan(config, motion, log_path(config), allow_low_margin), output, "excitation", **how)
-    return result if isinstance(result, int) else result.log_path
-
-
-def _lockstep(config: Config, motion: Motion, output: Output, *, allow_low_margin: bool, **how: bool) -> Path | int:
-    from jointctl.tools.session.plan import TerminalConsent
-    from jointctl.tools.sweeping.carry_out import lockstep_log
-
+    if not lockstep:
+        result = carried_out(RunPlan(config, motion, log_path(config), allow_low_margin), output, "excitation", **how)
+        return result if isinstance(result, int) else result.log_path
     log = lockstep_log(config, motion, TerminalConsent(output, **how), allow_low_margin=allow_low_margin)
     if log is None:
         output.note("dry run: nothing moved")
-        return 0
-    return log
+    return log or 0

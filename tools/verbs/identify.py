@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools.identification.tables import OURS, ForeignFormat
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path, configuration_files, configurations
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Identification, Options
     from jointctl.tools.identification.motion_data import Motion, MotionSettings
     from jointctl.tools.identification.plausibility import JointLimits
@@ -33,69 +33,6 @@ Data = Annotated[
 Model = Annotated[
     str, typer.Option("--model", help="auto (least held-out error), multi-stage, stribeck or coulomb-viscous")
 ]
-
-
-@dataclass(frozen=True)
-class TableOptions:
-    """How to read a table that is not ours; a field of `ForeignFormat` each."""
-
-    velocity_column: Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")] = None
-    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column")] = None
-    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column")] = None
-    velocity_unit: Annotated[
-        str | None, typer.Option("--velocity-unit", help="deg/s, rad/s, r/min, turn/s or count/s")
-    ] = None
-    side: Annotated[str | None, typer.Option("--side", help="of velocity and position: joint or motor")] = None
-    torque_side: Annotated[str | None, typer.Option("--torque-side", help="motor or joint")] = None
-    torque_unit: Annotated[str, typer.Option("--torque-unit", help="Nm, Ncm or mNm")] = "Nm"
-    current_unit: Annotated[str, typer.Option("--current-unit", help="A or mA")] = "A"
-    ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
-    torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
-    counts_per_turn: Annotated[
-        float | None, typer.Option("--counts-per-turn", help="of the shaft that is counted, for the unit count")
-    ] = None
-    reverse: Annotated[
-        list[str] | None,
-        typer.Option("--reverse", help="position, velocity, torque or load: the other sign; may be repeated"),
-    ] = None
-    where: Annotated[
-        list[str] | None,
-        typer.Option("--where", metavar="COLUMN=VALUE", help="only such lines, as of one joint; may be repeated"),
-    ] = None
-    delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
-    time_column: Annotated[
-        str | None, typer.Option("--time-column", help="name of the time column: the table is a motion in time")
-    ] = None
-    time_unit: Annotated[str, typer.Option("--time-unit", help="s, ms, us or ns")] = "s"
-    sample_rate_Hz: Annotated[
-        float | None, typer.Option("--sample-rate", help="samples a second, in place of a column of time")
-    ] = None
-    motion_column: Annotated[
-        str | None,
-        typer.Option("--motion-column", help="column that changes from one motion to the next, or time that goes back"),
-    ] = None
-    position_column: Annotated[str | None, typer.Option("--position-column", help="name of the position column")] = None
-    position_unit: Annotated[str | None, typer.Option("--position-unit", help="rad, deg, turn or count")] = None
-    position_side: Annotated[
-        str | None, typer.Option("--position-side", help="where it is not that of the velocity: joint or motor")
-    ] = None
-    load_column: Annotated[
-        str | None, typer.Option("--load-column", help="name of the column of the known load's torque (joint, Nm)")
-    ] = None
-    temperature_column: Annotated[
-        str | None, typer.Option("--temperature-column", help="name of the temperature column")
-    ] = None
-    temperature_unit: Annotated[str, typer.Option("--temperature-unit", help="degC, K or degF")] = "degC"
-
-
-def _given_format(table: TableOptions) -> ForeignFormat:
-    from jointctl.tools.identification.friction_data import ForeignFormat
-
-    lists = {"reverse": table.reverse or (), "where": table.where or ()}
-    return ForeignFormat(**{**vars(table), **lists})
-
-
-GivenFormat = Annotated["ForeignFormat | None", _given_format]
 
 
 @dataclass(frozen=True)
@@ -239,7 +176,7 @@ def identify(
         Path | None,
         typer.Option("--config", help="configuration to check plausibility against", autocompletion=configurations),
     ] = None,
-    given: GivenFormat = None,
+    given: ForeignFormat = OURS,
     options: Fit = None,
     report: Report = None,
 ) -> int:
@@ -249,7 +186,6 @@ def identify(
     from jointctl.tools.configuration.found_values import friction_snippet, with_friction_section, write_changed
     from jointctl.tools.configuration.load import shipped_config
     from jointctl.tools.drawing import png
-    from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
     from jointctl.tools.recording.report_page import check_target
@@ -268,7 +204,7 @@ def identify(
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
     in_time = is_series(data_path, given)
-    regressed = in_time or motion_of_plateaus(data_path, given or ForeignFormat()) is not None
+    regressed = in_time or motion_of_plateaus(data_path, given) is not None
     from_data = _from_motion if regressed else _from_plateaus
     found = from_data(data_path, given, options, limits, output)
     for note in found.notes:  # also with -q: a fit of other points than were measured is another result
@@ -305,7 +241,7 @@ def identify(
 
 
 def _from_plateaus(
-    path: Path, given: ForeignFormat | None, options: Options, limits: JointLimits | None, output: Output
+    path: Path, given: ForeignFormat, options: Options, limits: JointLimits | None, output: Output
 ) -> _Found:
     import numpy as np
 
@@ -375,10 +311,10 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
 
 
 def _from_motion(
-    path: Path, given: ForeignFormat | None, options: Options, limits: JointLimits | None, output: Output
+    path: Path, given: ForeignFormat, options: Options, limits: JointLimits | None, output: Output
 ) -> _Found:
     from jointctl.tools.identification import motion_report as reports
-    from jointctl.tools.identification.friction_data import ForeignFormat, refuse_unused
+    from jointctl.tools.identification.friction_data import refuse_unused
     from jointctl.tools.identification.motion_fit import identify_motion
     from jointctl.tools.identification.plausibility import Verdict, check_motion
     from jointctl.tools.recording.report_page import Section, from_terminal
@@ -387,7 +323,7 @@ def _from_motion(
     options.check()
     used = {"knee_radps", "seed", *vars(options.motion)}
     refuse_unused(options, used, f"{path}, which holds motions")
-    motion = motion_from(path, given or ForeignFormat(), options.motion)
+    motion = motion_from(path, given, options.motion)
     output.note(f"fitting {len(motion.time_s)} samples, which takes some seconds")
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
     if verdict.problems:

@@ -151,9 +151,10 @@ def map_verb(
     if not (assume_yes or dry_run or options.lockstep):
         require_terminal()
     moving = config_of_map(config, options)
-    measured = (_lockstep if options.lockstep else _measured)(
-        moving, output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run, allow_low_margin=allow_low_margin
-    )
+    measured = _measured(
+        moving, output, lockstep=options.lockstep, allow_low_margin=allow_low_margin,
+        assume_yes=assume_yes or options.lockstep, dry_run=dry_run,
+    )  # fmt: skip
     if isinstance(measured, int):
         return measured
     found = found_map(map_run(moving, *measured))
@@ -176,34 +177,29 @@ def map_verb(
     return 0
 
 
-def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] | int:
+def _measured(
+    config: Config, output: Output, *, lockstep: bool, allow_low_margin: bool, **how: bool
+) -> tuple[Any, float] | int:
     """(records, time from a command to its torque) of a run, or the exit code without one."""
-    from jointctl.tools.recording.run_log_reader import read_run_log
-    from jointctl.tools.session.plan import resolve
-    from jointctl.tools.sweeping.carry_out import carried_out
-
-    plan = resolve(config, allow_low_margin=how.pop("allow_low_margin"))
-    result = carried_out(plan, output, "map", **how)
-    return result if isinstance(result, int) else (read_run_log(result.log_path).records, _late_s(config))
-
-
-def _lockstep(config: Config, output: Output, *, allow_low_margin: bool, **how: bool) -> tuple[Any, float] | int:
-    from jointctl.tools.session.plan import TerminalConsent, configured
-    from jointctl.tools.sweeping.carry_out import simulated_run
-
-    consent = TerminalConsent(output, **how)
-    done = simulated_run(config, configured(config), consent, "map", allow_low_margin=allow_low_margin)
-    if done is None:
-        output.note("dry run: nothing moved")
-        return 0
-    return done[1].log, _late_s(config)
-
-
-def _late_s(config: Config) -> float:
     from jointctl.tools.analysis.linear_loop import loop_settings
+    from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.session.plan import TerminalConsent, configured, resolve
+    from jointctl.tools.sweeping.carry_out import carried_out, simulated_run
 
+    if lockstep:
+        consent = TerminalConsent(output, **how)
+        done = simulated_run(config, configured(config), consent, "map", allow_low_margin=allow_low_margin)
+        if done is None:
+            output.note("dry run: nothing moved")
+            return 0
+        records = done[1].log
+    else:
+        result = carried_out(resolve(config, allow_low_margin=allow_low_margin), output, "map", **how)
+        if isinstance(result, int):
+            return result
+        records = read_run_log(result.log_path).records
     settings = loop_settings(config)[0]
-    return settings.delay_s + settings.lag_s
+    return records, settings.delay_s + settings.lag_s
 
 
 def _table(found: FoundMap) -> Table:

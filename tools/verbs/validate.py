@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools.verbs.identify import GivenFormat, joint_limits
+from jointctl.tools.identification.tables import OURS, ForeignFormat
+from jointctl.tools.verbs.identify import joint_limits
 from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def validate(
     output: VerbOutput,
     *,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write")] = None,
-    given: GivenFormat = None,
+    given: ForeignFormat = OURS,
 ) -> int:
     """An identified friction model against other data of the same joint."""
     import numpy as np

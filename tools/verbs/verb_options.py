@@ -140,7 +140,7 @@ def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
     return moved(found, place(bus))
 
 
-def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config | ArmConfig:
+def loaded_joint_or_arm(config: ConfigPath, bus: BusOptions = AS_CONFIGURED) -> Config | ArmConfig:
     """As `loaded`; of an arm's file the arm, all joints on the bus that is named."""
     from jointctl.tools.configuration.arm import load_joint_or_arm
 
@@ -275,10 +275,6 @@ def _loaded(*, config: ConfigPath, bus: BusOptions) -> Config:
     return loaded(config, bus)
 
 
-def _loaded_joint_or_arm(*, config: ConfigPath, bus: BusOptions) -> Config | ArmConfig:
-    return loaded_joint_or_arm(config, bus)
-
-
 def _loaded_file_or_arm(config: ConfigPath) -> Config | ArmConfig:
     return loaded_joint_or_arm(config)
 
@@ -300,7 +296,7 @@ def _output(json: Json = False, quiet: Quiet = False) -> Output:
 
 
 JointOnBus = Annotated["Config", _loaded]
-JointOrArmOnBus = Annotated["Config | ArmConfig", _loaded_joint_or_arm]
+JointOrArmOnBus = Annotated["Config | ArmConfig", loaded_joint_or_arm]
 JointOrArm = Annotated["Config | ArmConfig", _loaded_file_or_arm]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]
 ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once

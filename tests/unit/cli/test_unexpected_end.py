@@ -243,7 +243,7 @@ def test_its_twin_another_verb_is_ended_by_a_signal_as_any_program(number: signa
 
 @pytest.mark.usefixtures("main_in_test")
 @pytest.mark.parametrize("by", ["", " by jointctl stop"])
-@pytest.mark.parametrize("where", ["check", "_loaded_joint_or_arm"])
+@pytest.mark.parametrize("where", ["output.Output.result", "configuration.arm.load_joint_or_arm"])
 def test_an_interruption_that_leaves_a_verb_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], by: str, where: str
 ) -> None:
@@ -252,10 +252,7 @@ def test_an_interruption_that_leaves_a_verb_is_one_line(
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt(*([by] if by else []))
 
-    target = (
-        "jointctl.tools.output.Output.result" if where == "check" else f"{verb_options.__name__}.loaded_joint_or_arm"
-    )
-    monkeypatch.setattr(target, interrupted)
+    monkeypatch.setattr(f"jointctl.tools.{where}", interrupted)
     monkeypatch.setattr(sys, "argv", ["jointctl", "check", "virtual"])
     with pytest.raises(SystemExit) as raised:
         main_module.main()

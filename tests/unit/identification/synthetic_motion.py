@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import lfilter
 
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.motion_table import read_motion
+from jointctl.tools.identification.tables import ForeignFormat
 
 RATIO = 100.0
 FORMAT = ForeignFormat(

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.motion_fit import identify_motion
 from jointctl.tools.identification.motion_table import read_motion
+from jointctl.tools.identification.tables import ForeignFormat
 from tests.unit.identification.synthetic_motion import FORMAT, RATIO, TrueJoint, motion_columns, read, write_table
 
 SETTINGS = MotionSettings()

@@ -15,12 +15,12 @@ from jointctl.drivers.errors import DataError, UsageError
 from jointctl.tools.identification.friction_data import (
     LEAST_SHARE,
     SWEEP_COLUMNS,
-    ForeignFormat,
     read_friction_data,
     relative_errors,
     relative_figures,
     sidecar_contents,
 )
+from jointctl.tools.identification.tables import ForeignFormat
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.validate import validate
 from tests.places import CONFIGS

@@ -18,7 +18,6 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.models import FORMS
 from jointctl.tools.identification.motion_data import Motion, MotionSettings, joined, motion_of_plateaus
@@ -32,6 +31,7 @@ from jointctl.tools.identification.motion_report import (
 from jointctl.tools.identification.motion_table import read_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
 from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.identification.tables import ForeignFormat
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.sweeping.carry_out import MeasuredPoint, PlateauResult
 from jointctl.tools.sweeping.data_file import SweepFile
