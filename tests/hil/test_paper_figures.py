@@ -170,14 +170,6 @@ def compare_with_the_page(rows: list[dict[str, str]]) -> None:
         assert told == pytest.approx(found, rel=0.05, abs=0.02)
 
 
-def test_the_synthetic_sweep_is_identified_to_its_noise() -> None:
-    found = identify_paper_friction(Options(swarm=SwarmSettings(particles=60, iterations=200)))
-    assert found.rmse_Nm == pytest.approx(0.0044, abs=0.0004)
-    assert found.stribeck_rmse_Nm == pytest.approx(0.0170, rel=0.05)
-    assert found.coulomb_rmse_Nm == pytest.approx(0.062, rel=0.05)
-    assert found.curve_error_Nm < 0.006
-
-
 # --- configs/precise.toml ---
 def test_the_precise_law_on_the_realistic_joint() -> None:
     found = figures("precise, R1")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -148,19 +147,6 @@ def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) ->
     for word in ("approach", "sweep      4 points", "motion", "limits", "dry run"):
         assert word in text
     assert list(tmp_path.iterdir()) == []
-
-
-# --- in real time, as processes ---
-def test_options_type_matches_the_command(config: Config) -> None:
-    from inspect import signature
-
-    from jointctl.tools.verbs.verb_options import grouped
-
-    parameters = set(signature(grouped(sweep)).parameters) - {
-        "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",
-        "foxglove", "ros2", "ros2_listen",
-    }  # fmt: skip
-    assert len(parameters) == len(dataclasses.fields(SweepOptions))
 
 
 def test_resume_revisits_what_did_not_settle_and_only_once(config: Config, tmp_path: Path) -> None:

@@ -284,14 +284,18 @@ def test_the_first_of_several_faults_is_the_one_that_is_reported() -> None:
         arm.wait(0.1)
 
 
-def test_nothing_enables_twice_and_nothing_moves_after_a_stop(arm: jointctl.Arm) -> None:
-    with pytest.raises(jointctl.UsageError, match="a new Arm"):
-        arm.enable()
-    arm.stop()
-    assert arm.state.phase == "finished"
-    for call in (lambda: arm.move_to(DOWN_rad), lambda: arm.command(DOWN_rad), lambda: arm.wait(0.1)):
-        with pytest.raises(jointctl.MotionFault):
-            call()
+@pytest.mark.parametrize(("made", "target_rad"), [(jointctl.Joint, 0.1), (jointctl.Arm, DOWN_rad)])
+def test_nothing_enables_twice_and_nothing_moves_after_a_stop(made: Any, target_rad: Any) -> None:
+    with made("virtual", lockstep=True) as moved:
+        moved.enable()
+        for _ in range(2):
+            with pytest.raises(jointctl.UsageError, match=f"enabled before.*a new {made.__name__}"):
+                moved.enable()
+            moved.stop()
+            assert moved.state.phase == "finished"
+        for call in (lambda: moved.move_to(target_rad), lambda: moved.command(target_rad), lambda: moved.wait(0.1)):
+            with pytest.raises(jointctl.MotionFault):
+                call()
 
 
 @pytest.mark.parametrize(("made", "target_rad"), [(jointctl.Joint, 0.2), (jointctl.Arm, DOWN_rad)])

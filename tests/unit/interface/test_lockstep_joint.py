@@ -240,18 +240,6 @@ def test_a_duration_is_refused_by_the_name_that_the_program_gave_it(joint: Joint
     joint.move_to(0.11, duration_s=1.0)
 
 
-def test_nothing_enables_twice_and_nothing_moves_after_a_stop(joint: Joint) -> None:
-    with pytest.raises(jointctl.UsageError, match="enabled before"):
-        joint.enable()
-    joint.stop()
-    assert joint.state.phase == "finished"
-    for call in (lambda: joint.move_to(0.1), lambda: joint.command(0.1), lambda: joint.wait(0.1)):
-        with pytest.raises(jointctl.MotionFault):
-            call()
-    with pytest.raises(jointctl.UsageError):
-        joint.enable()
-
-
 @pytest.mark.parametrize("wait_s", [0.001, 1e300])
 def test_a_fault_is_raised_with_its_cause_however_long_is_waited(wait_s: float) -> None:
     fault = pytest.raises(jointctl.MotionFault, match=r"(POSITION|VELOCITY)_LIMIT")
