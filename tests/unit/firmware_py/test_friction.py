@@ -47,18 +47,6 @@ def test_check_values(friction: Any, speed_degps: float, torque_Nm: float) -> No
     assert friction_motor_torque_Nm(friction, speed_degps * DEGREE) == pytest.approx(torque_Nm, abs=5.1e-6)
 
 
-def test_times_the_ratio_it_is_17_6_to_42_8_Nm_at_the_joint(friction: Any) -> None:
-    assert 121.0 * friction_motor_torque_Nm(friction, JUST) == pytest.approx(17.6, abs=0.05)
-    assert 121.0 * friction_motor_torque_Nm(friction, -200.0 * DEGREE) == pytest.approx(-42.8, abs=0.05)
-
-
-@pytest.mark.parametrize(("sign", "step_Nm"), [(1.0, 0.0017), (-1.0, 0.0013)])
-def test_the_stages_do_not_meet_at_the_knee(friction: Any, sign: float, step_Nm: float) -> None:
-    inside = friction_motor_torque_Nm(friction, sign * 40.0 * DEGREE)
-    outside = friction_motor_torque_Nm(friction, sign * (40.0 + JUST) * DEGREE)
-    assert abs(outside - inside) == pytest.approx(step_Nm, abs=5e-5)
-
-
 def test_every_speed_is_opposed_and_at_zero_there_is_none(friction: Any) -> None:
     speeds = np.linspace(0.01, 300.0, 500) * DEGREE
     assert all(friction_motor_torque_Nm(friction, v) > 0.1 for v in speeds)

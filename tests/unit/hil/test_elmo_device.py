@@ -52,22 +52,17 @@ def test_commands_are_encoded(arguments: tuple[str], line: bytes) -> None:
     assert encode(*arguments) == line
 
 
-@pytest.mark.parametrize("name", ["px", "P", "PXX", "", "P;", "PX\r"])
-def test_only_two_capital_letters_are_a_command(name: str) -> None:
-    with pytest.raises(ValueError, match="two capital letters"):
-        encode(name)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_value_must_be_finite(value: float) -> None:
-    with pytest.raises(ValueError, match="finite"):
-        encode("TC", None, value)
-
-
-@pytest.mark.parametrize("value", ["1;MO=1", "1\rMO=1", "x" * 70])
-def test_a_text_value_cannot_smuggle_a_second_command(value: str) -> None:
-    with pytest.raises(ValueError, match="characters"):
-        encode("XQ", None, value)
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        *(((name,), "two capital letters") for name in ("px", "P", "PXX", "", "P;", "PX\r")),
+        *((("TC", None, value), "finite") for value in (math.nan, math.inf, -math.inf)),
+        *((("XQ", None, text), "characters") for text in ("1;MO=1", "1\rMO=1", "x" * 70)),  # a second command
+    ],
+)
+def test_what_is_no_command_is_refused(arguments: tuple[Any, ...], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        encode(*arguments)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from jointctl.tools.identification.fit import (
     vector_limits,
     with_noise,
 )
-from jointctl.tools.identification.models import FORMS, basis, legendre, legendre_to_powers
+from jointctl.tools.identification.models import FORMS, basis
 from jointctl.tools.identification.swarm import (
     CHUNK,
     Samples,
@@ -67,13 +67,6 @@ def pooled_rmse_Nm(fits):
 
 def truth_Nm(problem, sign):
     return sign * friction_curve_Nm(paper_friction(), sign * problem.x * problem.top_radps)
-
-
-def test_legendre_in_powers_is_the_same_polynomial():
-    x = np.linspace(0.1, 1.2, 30)
-    coefficients = np.array([0.3, -0.2, 0.7, 0.05])
-    powers = legendre_to_powers(0.2) @ coefficients
-    assert np.polynomial.polynomial.polyval(x, powers) == pytest.approx(legendre(x, 0.2) @ coefficients, abs=1e-12)
 
 
 @pytest.mark.parametrize("form", list(FORMS))
