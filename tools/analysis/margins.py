@@ -7,6 +7,7 @@ phase margin / crossover frequency only indicates where to search, because a del
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -281,6 +282,7 @@ def _highest_peak(case: LoopSettings) -> tuple[float, float]:
     return peak, peak_radps / math.tau
 
 
+@functools.lru_cache(maxsize=32)  # a tune asks for the same loop in each of its steps
 def margins(settings: LoopSettings) -> Margins:
     """All margins of the loop with these settings; of several joints those of the worst one."""
     settings, most_sensitive = _worst_cases(settings)
