@@ -48,12 +48,18 @@ from jointctl.tools.analysis.linear_loop import (
 from jointctl.tools.analysis.margins import cases, converging, margins_on_grid
 from jointctl.tools.configuration.checks import OBSERVING
 from jointctl.tools.configuration.config import Adaptation, Config, Control
-from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
+from jointctl.tools.configuration.conversions import (
+    friction_fall_Nmspr,
+    joint_rad_per_count,
+    law_resolution_rad,
+    static_friction_Nm,
+)
 from jointctl.tools.configuration.load import shipped_control
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 STICKY = (25.0, 1.7, 3.0)  # the same of a joint that friction rules
 STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia: up to the former those above, from the latter on these
+SLIPS = 5.0  # times what kv damps: friction that falls so steeply makes a rigid joint stick and slip at low speed
 NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
@@ -444,10 +450,19 @@ def _frequencies_radps(config: Config, period_s: float) -> Array:
 def choose_gains(
     config: Config, intervals: Intervals, wanted: str = "auto", objective: str = "tracking"
 ) -> ChosenGains:
-    """With a law for the joint that was identified, which the configuration holds; a second."""
+    """With a law for the joint that was identified, which the configuration holds; a second.
+
+    A rigid joint that sticks and slips whatever is fed forward has neither adaptation nor pairing: what adapts takes
+    each slip for friction, and what it feeds forward then throws the joint at the next reversal.
+    """
     law = chosen_law(config, wanted)
     ready = config.model_copy(update={"control": _control(config, law.control())})
-    return _chosen(ready, law, intervals, loop_settings(ready)[0], objective)
+    found = _chosen(ready, law, intervals, loop_settings(ready)[0], objective)
+    damped_Nmspr = config.joint.inertia_kgm2 * found.best.settings.kv
+    if config.reducer is None and friction_fall_Nmspr(config) > SLIPS * damped_Nmspr:
+        without = {"adaptation": None, "observer_paired": False}
+        return replace(found, control=found.control.model_copy(update=without))
+    return found
 
 
 def gains_of_file(config: Config, settings: LoopSettings) -> ChosenGains:

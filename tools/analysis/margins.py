@@ -34,6 +34,9 @@ from jointctl.tools.configuration.config import Learning
 _ROUND_POINTS = 33  # of a round; an odd number keeps a symmetric extremum on the grid
 
 OBSERVING = tuple(ControllerKind[kind.upper()] for kind in OBSERVING_LAWS)
+LEARNING_FACTOR = 0.9  # of a repetition, wanted
+SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
+LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
 
 Function = Callable[[np.ndarray], np.ndarray]
 

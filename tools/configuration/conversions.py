@@ -123,6 +123,18 @@ def static_frictions_Nm(config: Config, friction: Friction) -> tuple[float, floa
     return abs(friction.positive.ts_Nm) * ratio, abs(friction.negative.ts_Nm) * ratio
 
 
+def friction_fall_Nmspr(config: Config) -> float:
+    """How steeply friction falls where the joint begins to slide, of the steeper direction; 0 where none is known."""
+    if config.friction is None:
+        return 0.0
+    constants, ratio = (
+        friction_constants(config.friction, config.joint.reduction_ratio)[0],
+        config.joint.reduction_ratio,
+    )
+    sides = (constants.positive, constants.negative)
+    return max(ratio * float((one.static_Nm - one.coulomb_Nm) / one.stribeck_speed_radps) for one in sides)
+
+
 def static_friction_Nm(config: Config) -> float | None:
     """The larger one of both directions, at the joint, under gravity and at the temperature at which it is greatest.
 

@@ -278,7 +278,7 @@ class Motion:
     work_J: float  # of the commanded torque without gravity: negative if the joint moved against it
     accelerating: float  # torque times change of speed, summed: negative if the joint sped up against the torque
     break_away_Nm: float  # commanded beside gravity when the joint began to move
-    torque_max_Nm: float
+    torque_max_Nm: float  # commanded, without kicks too short to move anything: those of a coarse encoder's counts
     torque_ratio: float | None  # measured over commanded; None where the drive measures none
     other_ratio: float | None  # way of the other encoder over that of this one
     other_moved_rad: float
@@ -321,9 +321,8 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        # a count of a coarse encoder is a kick of many Nm, too short to move anything
         break_away_Nm=float(np.abs(_smoothed(pushed[: first + 1 or None])).max()),
-        torque_max_Nm=float(np.abs(torque).max()),
+        torque_max_Nm=float(np.abs(smooth).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
         other_moved_rad=float(other[np.argmax(np.abs(other))]),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
@@ -34,7 +35,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import run_display
 from jointctl.tools.session.fault_words import FaultText
-from jointctl.tools.session.plan import Motion, RunPlan, TerminalConsent, require_approach
+from jointctl.tools.session.plan import ConfiguredMotion, Motion, Placed, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import latched_text
@@ -179,6 +180,20 @@ SWEEP_SHARE = 0.7  # of limits.velocity_max_radps, in the friction step: a soft 
 def with_motion(config: Config, motion: Trajectory) -> Config:
     """With an approach from wherever the step before has left the joint."""
     return config.changed(trajectory=motion, sequence__approach_s="auto")
+
+
+@dataclass(frozen=True)
+class VerifyingMotion(ConfiguredMotion):
+    """Its reading is watched with the friction that was found: that of the file as it was may be far too small."""
+
+    found: Config
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        placed = super().placed(report)
+        known = axis_constants(self.found, self.table, start_position_rad=report.start_position_rad)[0].limits
+        limits = placed.constants[0].limits
+        limits.frozen_torque_Nm, limits.frozen_cycles = known.frozen_torque_Nm, known.frozen_cycles
+        return placed
 
 
 def verifying_motion(config: Config) -> Trajectory:

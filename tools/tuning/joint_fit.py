@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,9 @@ from jointctl.tools.analysis.gains import Intervals
 from jointctl.tools.analysis.linear_loop import TwoMasses
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.found_values import Found, rounded
+from jointctl.tools.identification.friction_data import read_friction_data
+from jointctl.tools.identification.identification import Identification, Options, identify_friction
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
     LEVEL,
@@ -415,6 +419,28 @@ def _fitted(columns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
     left = values - columns @ found
     variance = float(left @ left) / max(len(values) - columns.shape[1], 1)
     return found, np.sqrt(variance * np.diag(np.linalg.pinv(columns.T @ columns)))
+
+
+# --- Friction, of the plateaus ---
+
+SWARM = SwarmSettings(particles=300, iterations=1500)
+PLACES = 1.05  # of the friction where the joint began to move: it is another one at each place
+SLOW = 2.0  # times the lowest speed: the static friction is no less than what those plateaus took
+
+
+def friction_of(path: Path, moved_Nm: float, reduction_ratio: float) -> Identification:
+    """Of the plateaus in that file; `moved_Nm` at the joint has moved it to either side from standstill.
+
+    Where the slow plateaus are left out, since a light joint swings there between sticking and sliding, the static
+    friction is continued from the faster ones, and may come out twice as large: it is no more than that torque.
+    """
+    data, options = read_friction_data(path, None), Options(swarm=SWARM)
+    found, speeds = identify_friction(data, options), np.abs(data.velocity_radps)
+    slow_Nm = np.abs(data.motor_torque_Nm[speeds <= SLOW * np.min(speeds)])
+    most_Nm = max(PLACES * moved_Nm / reduction_ratio, float(np.max(slow_Nm)))
+    if most_Nm < max(branch.static_Nm for branch in found.branches.values()):
+        return identify_friction(data, replace(options, static_max_Nm=most_Nm))
+    return found
 
 
 # --- The fit as values of a configuration ---

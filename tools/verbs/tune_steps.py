@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import (
     ConfigurationError,
     DataError,
@@ -49,15 +48,13 @@ from jointctl.tools.configuration.found_values import (
     without_friction,
 )
 from jointctl.tools.configuration.load import load_config, read_text
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.configuration.sections import LuGre, ReducerMap, Trajectory
-from jointctl.tools.identification.friction_data import read_friction_data
-from jointctl.tools.identification.identification import Identification, Options, identify_friction
+from jointctl.tools.identification.identification import Identification
 from jointctl.tools.identification.identification_report import section_values
-from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
-from jointctl.tools.session.plan import ConfiguredMotion, Placed
+from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
@@ -69,6 +66,7 @@ from jointctl.tools.tuning.carry_out import (
     Carrier,
     NotCarriedOut,
     TooWeak,
+    VerifyingMotion,
     require_one_joint,
     require_same_joint,
     response_by_any_law,
@@ -85,7 +83,14 @@ from jointctl.tools.tuning.frequency_response import (
     motor_fed,
     with_torque_limit,
 )
-from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_of, gravity_of, values_of_fit
+from jointctl.tools.tuning.joint_fit import (
+    JointFit,
+    fit_from_dict,
+    fit_of,
+    friction_of,
+    gravity_of,
+    values_of_fit,
+)
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text, measured_bristles
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS
@@ -99,6 +104,7 @@ STATE, ANEW = "steps.json", "without --resume it begins anew"
 OTHER = "of another drive, or of a simulated joint instead of a real one"
 FRICTION_SHARE = 0.75  # of the torque that gravity leaves: more friction leaves nothing to move with
 OF_GAINS = (Fault.LIMIT_CYCLE, Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
+ALLOWED_FAULTS = {"the same before": (*OF_GAINS, Fault.POSITION_FROZEN), "refinement": OF_GAINS}  # by motion
 MOVES_WRONGLY = (Fault.POSITION_FROZEN, Fault.POSITION_LIMIT, *OF_GAINS[1:])
 SOFTER = ("the step pulls with a law of its own, as stiff as the static friction of [friction] asks for: a "
           "greater loop.rate_Hz, less friction where [friction] has too much, wider limits.position_*")  # fmt: skip
@@ -106,26 +112,11 @@ STRONGER = 2.0  # of the check of the direction, as long as the joint stands sti
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
 SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the next where the slow ones swing
 SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
-SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_FROM_s = 5.0
 WORSE = 1.5  # times the error with the gains as they were
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
 REFINE_APART = 0.15  # share by which gains that are tried must differ
-
-
-@dataclass(frozen=True)
-class VerifyingMotion(ConfiguredMotion):
-    """Its reading is watched with the friction that was found: that of the file as it was may be far too small."""
-
-    found: Config
-
-    def placed(self, report: CommissioningReport) -> Placed:
-        placed = super().placed(report)
-        known = axis_constants(self.found, self.table, start_position_rad=report.start_position_rad)[0].limits
-        limits = placed.constants[0].limits
-        limits.frozen_torque_Nm, limits.frozen_cycles = known.frozen_torque_Nm, known.frozen_cycles
-        return placed
 
 
 @dataclass
@@ -408,7 +399,9 @@ class Tune:
             raise NotCarriedOut(command.drive_state, "" if control is None else control.signals.stopped_by)
 
     def identified(self) -> Identification:
-        return identify_friction(read_friction_data(self.folder / "friction.csv", None), Options(swarm=SWARM))
+        pushed = [finding["numbers"].get("torque_max_Nm", 0.0) for finding in self.state["direction"]]
+        moved_Nm = (max(pushed, default=0.0) or math.inf) + abs(self.config.joint.gravity_Nm)  # which may hold it
+        return friction_of(self.folder / "friction.csv", moved_Nm, self.config.joint.reduction_ratio)
 
     def _take_friction(self, kept: dict[str, Any]) -> None:
         self.carrier.output.note(f"  {kept['points']} plateaus, RMSE {1e3 * kept['rmse_Nm']:.3g} mNm at the motor")
@@ -464,7 +457,7 @@ class Tune:
         self._require(self.gains)
         return self._kept(self.gains)
 
-    def _require_same_joint(self, when: str) -> None:
+    def _require_same_joint(self, when: str, *, surely: bool = False) -> None:
         assert self.fit is not None
         assert self.response is not None
         law = self.state["response"].get("law", ALONE)
@@ -472,6 +465,8 @@ class Tune:
         try:
             require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
         except (MarginError, TooWeak) as error:  # the law of the response, on the joint that is known now
+            if surely and isinstance(error, TooWeak):
+                raise
             self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 
     @staticmethod
@@ -512,7 +507,10 @@ class Tune:
             require_margin(before)
         except JointctlError as error:
             return {**found, "before_refused": error.message}
-        return {**found, "before": self._verified(before, "the same before")}
+        found["before"] = self._verified(before, "the same before")
+        if found["before"].get("fault") == Fault.POSITION_FROZEN.name:  # by a wrong friction, or by a dead encoder
+            self._require_same_joint("after the old gains", surely=True)
+        return found
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
         rmse = {when: kept[when]["rmse_mrad"] for when in ("before", "after") if "rmse_mrad" in kept.get(when, {})}
@@ -539,7 +537,7 @@ class Tune:
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
         moving = with_motion(config, self.verifying)
         motion = VerifyingMotion(moving, trajectory_table(moving), self.config)
-        carried = self.carrier.run(moving, motion, title, also_faults=() if title == "verification" else OF_GAINS)
+        carried = self.carrier.run(moving, motion, title, also_faults=ALLOWED_FAULTS.get(title, ()))
         rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
         rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * self.verifying.duration_s)]
         if carried.text is not None or not len(rows):

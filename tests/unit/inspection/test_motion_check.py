@@ -139,6 +139,7 @@ def test_the_kicks_of_a_coarse_encoder_are_not_taken_for_what_moves_the_joint(bi
     findings, _, fault = checked(config)
     assert fault is Fault.NONE
     assert 0.95 * 19.0575 < findings["friction"].numbers["break_away_Nm"] < 1.25 * 19.0575
+    assert 0.95 * 19.0575 < findings["direction"].numbers["torque_max_Nm"] < 1.35 * 19.0575
 
 
 @pytest.mark.parametrize("gravity_Nm", [-12.0, 0.0, 12.0])

@@ -16,6 +16,7 @@ from jointctl.tools.analysis.gains import (
     _FLEXIBLE,
     LAWS,
     SENSITIVITY,
+    SLIPS,
     STICKY,
     UNUSUAL,
     ChosenGains,
@@ -31,6 +32,7 @@ from jointctl.tools.analysis.gains import (
 from jointctl.tools.analysis.linear_loop import Encoders, LoopSettings, TwoMasses, linear_loop, loop_settings
 from jointctl.tools.analysis.margins import converging, learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
+from jointctl.tools.configuration.conversions import friction_fall_Nmspr
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
@@ -110,6 +112,19 @@ def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> N
         assert learning_convergence(settings, found.control.learning).worst_factor < 1.0
     adapts = law == "precise"  # the paper's law has no observer to learn from
     assert (found.control.adaptation is not None) == found.control.observer_paired == adapts
+
+
+@pytest.mark.parametrize(("inertia_kgm2", "slips"), [(0.1, True), (0.4, False)])
+def test_a_joint_that_sticks_and_slips_at_low_speed_has_nothing_that_adapts(inertia_kgm2: float, slips: bool) -> None:
+    """Its friction falls by more than kv damps; what had adapted to the slips threw it at the next reversal."""
+    fit = fit_of(inertia_kgm2, 1.5e-3)
+    config = known(shipped("precise"), fit)
+    found = choose_gains(config, fit.intervals(), "precise")
+    fall_Nmspr = 121 * (0.14537 - 0.11985) / math.radians(1.2301)  # of the positive direction, the steeper one
+    assert friction_fall_Nmspr(config) == pytest.approx(fall_Nmspr)
+    assert (fall_Nmspr > SLIPS * inertia_kgm2 * found.best.settings.kv) is slips
+    assert (found.control.adaptation is None) is slips
+    assert found.control.observer_paired is not slips
 
 
 def test_friction_without_bristles_adapts_to_nothing() -> None:

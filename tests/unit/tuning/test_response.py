@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError, MotionFault, UsageError
-from jointctl.firmware_py.friction import friction_curve_Nm
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
@@ -50,10 +50,19 @@ from jointctl.tools.tuning.frequency_response import (
     room_rad,
     speed_and_period,
 )
-from jointctl.tools.tuning.joint_fit import Estimate, Gravity, fit_from_dict, fit_joint, fitted_again, gravity_of
+from jointctl.tools.tuning.joint_fit import (
+    Estimate,
+    Gravity,
+    fit_from_dict,
+    fit_joint,
+    fitted_again,
+    friction_of,
+    gravity_of,
+)
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
+from tests.unit.identification.synthetic_friction import paper_data
 
 T = 1e-3
 SOFT = TwoMasses(0.9, 1.3, 2.4e4, 15.0, (0.0, 0.0), (12.0, 0.0))
@@ -273,6 +282,20 @@ def test_intervals_of_a_light_joint_with_much_friction_are_wider_and_others_stay
     assert much.inertia_kgm2.half == pytest.approx(0.36 * 2.1, rel=0.05)
     assert much.late_s.half == pytest.approx(0.45e-3, rel=0.05)
     assert much.delay_s == fit.delay_s
+
+
+@pytest.mark.parametrize(
+    ("moved_Nm", "static_Nm"), [(math.inf, (0.214, 0.164)), (19.0, (0.165, 0.164)), (12.0, (0.139, 0.139))]
+)
+def test_a_static_friction_that_no_plateau_shows_is_no_more_than_what_moved_the_joint(
+    monkeypatch: pytest.MonkeyPatch, moved_Nm: float, static_Nm: tuple[float, float]
+) -> None:
+    """Truly 0.145 and 0.158 Nm, plateaus from 2 deg/s on.  No less than those took: 0.139 Nm."""
+    speeds = np.geomspace(2.0, 40.0, 17) * DEGREE
+    data = paper_data(seed=4, velocity_radps=np.concatenate((-speeds[::-1], speeds)), noise_Nm=1e-3)
+    monkeypatch.setattr(joint_fit, "read_friction_data", lambda *_: data)
+    branches = friction_of(data.path, moved_Nm, 121.0).branches
+    assert tuple(branches[side].static_Nm for side in ("positive", "negative")) == pytest.approx(static_Nm, abs=1e-3)
 
 
 @pytest.mark.parametrize(("believed", "motor"), [(None, 1.1), (0.9, 0.9), (1.4, 1.4)])
