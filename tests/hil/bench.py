@@ -86,9 +86,9 @@ class Bench:
         script.write_text(text)
         return self.start(script=script)
 
-    def joint(self, config: str) -> None:
+    def joint(self, config: str) -> Any:
         """The virtual joint in this process, for tests that need one and no more."""
-        self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
+        return self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
 
     def with_joint(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
         """A configuration as of `config`, and its virtual joint in this process."""

@@ -115,7 +115,13 @@ def test_a_fault_in_a_step_ends_it_in_one_line(tmp_path: Path, kind: str, at_s: 
 
 @pytest.mark.parametrize(
     ("kind", "fault"),
-    [("encoder_stuck", "POSITION_FROZEN"), ("current_loop_dead", "POSITION_FROZEN"), ("frames_lost", "STALE_SAMPLE")],
+    [
+        ("encoder_stuck", "POSITION_FROZEN"),
+        ("current_loop_dead", "POSITION_FROZEN"),
+        ("frames_lost", "STALE_SAMPLE"),
+        ("drive_fault", "DRIVE_FAULT"),
+        ("drive_reboot", "DRIVE_RESTARTED"),
+    ],
 )
 def test_a_fault_while_the_joint_stands_ends_it_and_keeps_the_steps_before(
     tmp_path: Path, kind: str, fault: str

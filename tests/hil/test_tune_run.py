@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
 import signal
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
+from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.session.plan import TerminalConsent
+from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.verbs import tune_steps
+from jointctl.tools.verbs.tune import TuneOptions
+from jointctl.tools.verbs.tune_steps import STEPS, Tune
+from tests.configurations import written
 
 LATE_CYCLES = 5  # far more than the delay that is measured
 
@@ -28,7 +40,7 @@ def joint(bench: Any) -> Any:
     """The bench with a joint as that of `precise` running, whose tune is short; limits for a busy computer."""
     bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=1.0,
                  sequence__supervisor_timeout_s=5.0, **SHORT)  # fmt: skip
-    bench.joint("joint.toml")
+    bench.virtual = bench.joint("joint.toml")
     return bench
 
 
@@ -67,6 +79,88 @@ def test_ctrl_c_in_the_response_ramps_down_and_keeps_the_steps_before(joint: Any
     assert joint.disabled()
     assert path.read_text() == text
     assert '"direction"' in (joint.folder / "mine.tune" / "steps.json").read_text()
+
+
+def tune_of(path: Path, *, lockstep: bool) -> Tune:
+    output = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    return Tune(load_config(path), TuneOptions(lockstep=lockstep), carrier, path.with_suffix(".tune"))
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Tune:
+    """The steps before the bristles, of that joint in simulated time."""
+    path = written(tmp_path_factory.mktemp("simulated") / "mine.toml", "precise", **SHORT)
+    job = tune_of(path, lockstep=True)
+    with patch.object(tune_steps, "STEPS", STEPS[: STEPS.index("bristles")]):
+        job.carry_out()
+    return job
+
+
+def begun(joint: Any, simulated: Tune, *steps: str) -> Path:
+    """A real-time tune of that joint with these steps done."""
+    path: Path = joint.folder / "mine.toml"
+    path.write_text((joint.folder / "joint.toml").read_text())
+    job = tune_of(path, lockstep=False)
+    job._open()
+    job.state = {name: simulated.state[name] for name in steps}
+    job._save()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("steps", "number"),
+    [(3, signal.SIGINT), (4, signal.SIGINT), (4, signal.SIGTERM)],
+    ids=["friction", "bristles", "bristles, SIGTERM"],
+)
+def test_a_stop_in_a_step_releases_the_joint_and_the_next_tune_begins_with_that_step(
+    joint: Any, simulated: Tune, steps: int, number: signal.Signals
+) -> None:
+    """Each says where it is meanwhile: the four minutes of the friction were without a line."""
+    path = begun(joint, simulated, *STEPS[:steps])
+    text = path.read_text()
+    for _ in range(2):
+        started = joint.start("tune", "mine.toml", "-y", "--resume")
+        started.until(lambda run=started: "\n  tracking" in run.err, "tracking")
+        assert f"\n{STEPS[steps]}\n" in started.err
+        started.signal(number)
+        done = started.finished()
+        assert done.code == 130, done.err
+        assert f"stopped by {number.name}; mine.toml is as it was; --resume goes on" in done.err
+        assert f"{STEPS[steps - 1]}: done before" in done.err
+        assert joint.disabled()
+        assert path.read_text() == text
+        kept = json.loads((joint.folder / "mine.tune" / "steps.json").read_text())
+        assert {*kept} & {*STEPS} == {*STEPS[:steps]}
+
+
+def kill_loop(joint: Any, tune: Any) -> None:
+    os.kill(tune.child("loop_process"), signal.SIGKILL)
+
+
+def switch_off(joint: Any, tune: Any) -> None:
+    """As STO does: the drive leaves Operation Enabled by itself."""
+    joint.virtual._devices[0].device[0].state = PowerState.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize(("end", "words"), [(kill_loop, "the loop process"), (switch_off, "DRIVE_NOT_ENABLED (9)")])
+def test_an_end_while_the_joint_stands_switches_the_drive_off_and_keeps_the_steps_before(
+    joint: Any, simulated: Tune, end: Any, words: str
+) -> None:
+    path = begun(joint, simulated, *STEPS[:4])
+    started = joint.start("tune", "mine.toml", "-y", "--resume")
+    started.until(lambda: "\n  tracking" in started.err, "tracking")
+    end(joint, started)
+    done = started.finished()
+    assert done.code == 7, done.err
+    line = next(line for line in done.err.splitlines() if line.startswith("error: "))
+    assert line.startswith("error: bristles: ")
+    assert words in line
+    assert "mine.toml is as it was" in line
+    assert "has the steps before" in line
+    assert "Traceback" not in done.err
+    assert joint.disabled()
+    assert '"friction"' in (path.with_suffix(".tune") / "steps.json").read_text()
 
 
 def held_up(joint: Any, done: Any) -> bool:

@@ -66,8 +66,8 @@ class StopSignals:
 
     @property
     def stopped_by(self) -> str:
-        """What an interruption is called after which nothing is known but that."""
-        return STOP_COMMAND if self.commanded_ns else "interruption"
+        """What has interrupted it, as far as that is known."""
+        return self.name or "interruption"
 
     def on_signal(self, number: int, _: FrameType | None) -> None:
         if self._again:

@@ -119,8 +119,9 @@ class Carrier:
             self.control.signals.drives = drives
 
     def quietly(self) -> Output:
-        """For a part whose result is not that of the command."""
-        return replace(self.output, quiet=True, json=False, taken=lambda _: None)
+        """For a part whose result is not that of the command; in simulated time without its progress."""
+        quiet = self.output.quiet or self.control is None
+        return replace(self.output, quiet=quiet, json=False, taken=lambda _: None)
 
     def run(self, config: Config, motion: Motion, title: str, *, also_faults: Container[Fault] = ()) -> Carried:
         """The records; `MotionFault` after any other fault than these, `NotCarriedOut` where it was not begun."""
@@ -252,9 +253,9 @@ class ResponseTask:
     largest_Nm: float
     chosen: bool = False  # the gains are none of the file
 
-    def motion(self, peak_Nm: float, pairs: int) -> ResponseMotion:
+    def motion(self, peak_Nm: float, pairs: int, *, last: bool = False) -> ResponseMotion:
         plan = ResponsePlan(legs_of(self.config, pairs), self.sine, peak_Nm)
-        return ResponseMotion(self.config, plan, self.largest_Nm)
+        return ResponseMotion(self.config, plan, peak_Nm if last else self.largest_Nm)
 
 
 def response_task(config: Config, torque_Nm: float | None, legs: int, law: ResponseLaw = WEAK) -> ResponseTask:
@@ -325,7 +326,7 @@ def _whole(
     task: ResponseTask, carrier: Carrier, peak_Nm: float, before: FrequencyResponse | None
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
     """Of all legs."""
-    found, records, plan = _stage(task, carrier, peak_Nm, task.pairs)
+    found, records, plan = _stage(task, carrier, peak_Nm, task.pairs, last=True)
     carrier.output.note(f"  {text_Nm(found.peak_Nm, 2)}: coherence {found.coherence:.3f}, {found.legs} legs")
     if before is not None:
         _refuse_growth(before, found)
@@ -422,7 +423,7 @@ def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarr
 def require_same_joint(task: ResponseTask, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
     """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
     peak_Nm = min(peak_Nm, task.largest_Nm)
-    inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS)[0], fit)
+    inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS, last=True)[0], fit)
     _refuse_another("the response", fit.inertia_kgm2, when, inertia)
     carrier.output.note(f"  the same joint: {inertia.value:.4g} kg m^2 {when}")
 
@@ -490,10 +491,10 @@ def _too_weak(config: Config, carried: Carried, peak_Nm: float) -> bool:
 
 
 def _stage(
-    task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int
+    task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int, *, last: bool = False
 ) -> tuple[FrequencyResponse, Any, ResponsePlan]:
     """Once more where legs were lost to a computer that stood still for a moment: a tune of minutes need not end."""
-    motion = task.motion(peak_Nm, pairs)
+    motion = task.motion(peak_Nm, pairs, last=last)
 
     def moved() -> Any:
         title = f"{task.config.path.stem}: response, {text_Nm(peak_Nm, 2)}"

@@ -259,7 +259,7 @@ def motor_fed(config: Config) -> Config:
 
 @dataclass(frozen=True)
 class ResponseMotion:
-    """See `session.plan.Motion`; `config` is that of `config_of_response`; later stages excite by up to `most_Nm`."""
+    """See `session.plan.Motion`; `config` is that of `config_of_response`; `most_Nm`: of it and later stages."""
 
     config: Config
     plan: ResponsePlan
@@ -294,15 +294,16 @@ class ResponseMotion:
         plan, config = self.plan, self.config
         top = float(np.max(np.abs(plan.legs.velocity_radps)))
         duration_s = len(plan.legs.velocity_radps) / config.loop.rate_Hz
-        frequency, control = plan.sine.frequency_Hz, config.control
+        frequency, control, more = plan.sine.frequency_Hz, config.control, plan.peak_Nm < self.most_Nm
+        then = f"; the same again with more while the coherence is low, up to {text_Nm(self.most_Nm, 2)}"
         return [
             *joint_lines(report, config.limits),
             f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
             f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
             f"{top:.2f} rad/s, {duration_s:.0f} s",
             f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
-            f"at first {text_Nm(plan.peak_Nm, 2)} on top of what the motion takes; the same again with more while the "
-            f"coherence is low, up to {text_Nm(self.most_Nm, 2)}, about 2 minutes in all",
+            f"{'at first ' if more else ''}{text_Nm(plan.peak_Nm, 2)} on top of what the motion takes"
+            f"{f'{then}, about 2 minutes in all' if more else ''}",
             f"law        kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s; "
             "a stiffer one follows where the weak one is too weak for the friction",
             limits_line(config.limits),

@@ -93,7 +93,7 @@ class Sweep:
         self._attached_Nm = math.nan  # the load that the user has confirmed
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
-        self._consent = TerminalConsent(
+        self.consent = TerminalConsent(
             output, assume_yes=options.assume_yes or options.lockstep, dry_run=options.dry_run
         )
 
@@ -193,7 +193,7 @@ class Sweep:
                 self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
 
         if options.lockstep:
-            ended = sweep_in_lockstep(swept, meter, self._consent, begin, allow_low_margin=options.allow_low_margin)
+            ended = sweep_in_lockstep(swept, meter, self.consent, begin, allow_low_margin=options.allow_low_margin)
             if ended is None:
                 return None
             self._raise_fault(*ended)
@@ -207,7 +207,7 @@ class Sweep:
         assert self.control is not None
         plan = sweep_run(swept, allow_low_margin=options.allow_low_margin)
         beside = display if self._others is None else self._others.beside(display)
-        session = Session(plan, self._consent, self.output, self.control, beside)
+        session = Session(plan, self.consent, self.output, self.control, beside)
         try:
             result = session.run()
         finally:
@@ -292,7 +292,7 @@ class Sweep:
             why = f"; the last one: {problem}; a longer --dwell may help" if problem else ""
             self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown}{why}")
         if stopped:
-            kept = f"what was measured is in {self.out}, --resume goes on" if done else "nothing was measured"
+            kept = f"what was measured is in {self.out}, --resume goes on" if done else "no plateau was measured"
             self.output.note(f"stopped by {stopped}; {kept}")
             return INTERRUPTED
         return 0

@@ -391,6 +391,8 @@ class Tune:
             for old in (path, path.with_suffix(".json")):
                 old.unlink(missing_ok=True)
         command.control = control = self.carrier.control
+        if control is not None:
+            command.consent = self.carrier.consent
         try:
             ended = command.run()
         finally:

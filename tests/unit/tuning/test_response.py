@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -284,6 +285,15 @@ def test_intervals_of_a_light_joint_with_much_friction_are_wider_and_others_stay
     assert much.delay_s == fit.delay_s
 
 
+@pytest.mark.parametrize("last", [False, True])
+def test_only_a_stage_that_others_may_follow_announces_more_torque(last: bool) -> None:
+    """The last one, and the short response of a later step, said the same of minutes and torque that did not come."""
+    motion = response_task(shipped("precise"), None, AS_IT_FITS.legs).motion(4.5, 2, last=last)
+    (line,) = (one for one in motion.placed(Mock(start_position_rad=0.0, remarks=())).lines if "excitation" in one)
+    assert ("at first 4.50 Nm" in line) == ("up to 9.00 Nm" in line) == ("minutes" in line) is not last
+    assert "4.50 Nm on top of what the motion takes" in line
+
+
 @pytest.mark.parametrize(
     ("moved_Nm", "static_Nm"), [(math.inf, (0.214, 0.164)), (19.0, (0.165, 0.164)), (12.0, (0.139, 0.139))]
 )
@@ -515,7 +525,7 @@ def test_more_torque_than_the_law_holds_ends_with_that_of_the_stage_before(
 ) -> None:
     stages: list[tuple[float, int]] = []
 
-    def stage(_: Any, __: Any, peak_Nm: float, pairs: int) -> Any:
+    def stage(_: Any, __: Any, peak_Nm: float, pairs: int, **_how: bool) -> Any:
         stages.append((peak_Nm, pairs))
         if peak_Nm > 3.0:
             raise TooWeak("it swings")
