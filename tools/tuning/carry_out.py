@@ -406,7 +406,7 @@ def response_by_any_law(
             if law not in _MUCH_FRICTION[:2] or FED not in others:
                 raise
             carrier.output.note(f"  {error.message}: once more, {FED}")
-            return by(FED)
+            return by(FED, *(other for other in others if other == FED_STIFFEST))  # it may have stuck and slid as fast
         return by(*others)
 
     return by(*laws)

@@ -502,6 +502,24 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     assert laws == ([*attempts[2:], attempts[1]] if weak else [attempts[2], attempts[1]] if late else attempts[2:3])
 
 
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_light_joint_that_swings_fast_and_then_stands_gets_the_stiffest_law(stands: bool) -> None:
+    """It stuck and slid at 9 Hz, which looked like late torque; one that swings under the weak law as well is late."""
+    laws: list[float] = []
+
+    def run(config: Any, *_: Any, **__: Any) -> Carried:
+        laws.append(config.control.kp)
+        log = new(LogRecord, 100)
+        log.phase = AxisPhase.TRACKING
+        fault = Fault.FOLLOWING_ERROR if stands and config.control.kp == 100.0 else Fault.LIMIT_CYCLE
+        return Carried(log, fault, FaultText("happened", "cause", "next"), "", 9.0)
+
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
+    with pytest.raises(MotionFault, match="LIMIT_CYCLE"):
+        response_by_any_law(with_break_away(shipped("precise", joint__inertia_kgm2=0.5), 20.0), 8, carrier, 55.0)
+    assert laws == [1600.0, 100.0, 3200.0][: 3 if stands else 2]
+
+
 @pytest.mark.parametrize(("name", "kps"), [("precise", [100.0, 1600.0, 3200.0]), ("realistic", [100.0])])
 def test_a_stiffer_law_follows_only_where_the_gate_lets_it(name: str, kps: list[float]) -> None:
     """Without a friction nothing can be fed forward; the law of the file takes the place of the weak one alone."""
