@@ -455,11 +455,6 @@ def learning_convergence(settings: LoopSettings, learning: Learning) -> Converge
     return slowest_convergence(repeated_loops(settings), learning)
 
 
-LEARNING_FACTOR = 0.9  # of a repetition, wanted
-SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
-LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
-
-
 def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
     """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain.
 
