@@ -127,10 +127,8 @@ def friction_fall_Nmspr(config: Config) -> float:
     """How steeply friction falls where the joint begins to slide, of the steeper direction; 0 where none is known."""
     if config.friction is None:
         return 0.0
-    constants, ratio = (
-        friction_constants(config.friction, config.joint.reduction_ratio)[0],
-        config.joint.reduction_ratio,
-    )
+    ratio = config.joint.reduction_ratio
+    constants = friction_constants(config.friction, ratio)[0]
     sides = (constants.positive, constants.negative)
     return max(ratio * float((one.static_Nm - one.coulomb_Nm) / one.stribeck_speed_radps) for one in sides)
 
