@@ -59,15 +59,20 @@ def shortened(value: str) -> str:
     return f"{value[: LONGEST_VALUE - _TAIL - 3]}...{value[-_TAIL:]}"
 
 
-def decimals_of(torque_Nm: float, least: int) -> int:
-    """Of a torque, or of a row with this greatest one: so many at least, two digits that count below 1 Nm."""
-    size = abs(torque_Nm)
+def decimals_of(value: float, least: int) -> int:
+    """Of a torque or a speed, or of a row with this greatest one: so many at least, two digits that count below 1."""
+    size = abs(value)
     return max(least, 1 - math.floor(math.log10(size))) if 1e-6 < size < 1.0 else least
 
 
 def text_Nm(torque_Nm: float, decimals: int = 1) -> str:
     """A torque with its unit."""
     return f"{torque_Nm:.{decimals_of(torque_Nm, decimals)}f} Nm"
+
+
+def text_radps(speed_radps: float, decimals: int = 2) -> str:
+    """A speed with its unit."""
+    return f"{speed_radps:.{decimals_of(speed_radps, decimals)}f} rad/s"
 
 
 def message_line(text: str) -> str:

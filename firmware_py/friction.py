@@ -301,7 +301,6 @@ AVERAGED_s = 1.0  # of the observer's torque in one direction
 LEAST_MOVED_s = 0.3  # in each direction, before their mean counts
 EVERY = 10  # cycles between two steps of the regression
 STILL_radps = 1e-4  # below this desired speed the parts say nothing
-NOISE_Nm = 5.0  # of the regression: what friction and ripple do not explain, and its samples are not independent
 DRIFT = 1e-4  # of a weight's first variance, that comes back in each step
 
 
@@ -564,7 +563,7 @@ def adapt(
 def _regress(constants: AdaptationConstants, state: AdaptationState, wanted_Nm: float) -> None:
     """One step of the Kalman filter of the weights."""
     used = SINES + 2 * constants.ripples
-    size = NOISE_Nm * NOISE_Nm
+    size = constants.noise_Nm * constants.noise_Nm
     error = wanted_Nm
     for i in range(used):
         total = 0.0

@@ -116,6 +116,7 @@ class AdaptationConstants:
     seen: VelocityConstants  # of the speeds that a flexible joint is seen to have
     ripple_Nm: f8  # of the sines at first
     ripple_max_Nm: f8
+    noise_Nm: f8  # of the regression: what friction and ripple do not explain, and its samples are not independent
     ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
 
 

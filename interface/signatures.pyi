@@ -123,7 +123,7 @@ def map(
     target: int | None = None,
     port: str | None = None,
     travel_rad: float | None = None,
-    speed_radps: float = 0.03,
+    speed_radps: float | None = None,
     lockstep: bool = False,
     write: bool = False,
     figure: str | Path | None = None,

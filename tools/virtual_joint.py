@@ -44,7 +44,7 @@ from jointctl.tools.configuration.canopen import (
     torque_limit_object,
 )
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, first_on_bus, raise_if
-from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import friction_constants, static_frictions_Nm, torque_constant_NmpA
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
 
 if TYPE_CHECKING:
@@ -174,16 +174,24 @@ def device_settings(config: Config) -> DeviceSettings:
         torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
-        **_drive_loops(drive, config.joint.inertia_kgm2),
+        **_drive_loops(drive, config),
     )
 
 
-def _drive_loops(drive: CanopenSection, inertia_kgm2: float) -> dict[str, Any]:
+SUITED_FRICTION_radps2 = 15.0  # static friction over the inertia, up to which a gain for the inertia overcomes it
+MOST_STIFF = 10.0  # of the gains for the inertia: 950 1/s, which a current lag of a millisecond bears
+
+
+def _drive_loops(drive: CanopenSection, config: Config) -> dict[str, Any]:
     """Its own loops: the gains that the configuration has, else those of `DeviceSettings`, which suit 2.1 kg m2.
 
-    The velocity loop brakes as well, in every mode: a real drive's was tuned to its joint's inertia.
+    The velocity loop brakes as well, in every mode: a real drive's was tuned to its joint's inertia and friction.
     """
-    suited = inertia_kgm2 / PlantSettings.inertia_kgm2
+    assert config.virtual is not None
+    inertia_kgm2, friction = config.joint.inertia_kgm2, config.virtual.friction or config.friction
+    static_Nm = 0.0 if friction is None else max(static_frictions_Nm(config, friction))
+    sticky = static_Nm / inertia_kgm2 / SUITED_FRICTION_radps2
+    suited = min(max(sticky, 1.0), MOST_STIFF) * inertia_kgm2 / PlantSettings.inertia_kgm2
     gains: dict[str, Any] = {
         name: getattr(DeviceSettings, name) * suited for name in ("velocity_gain_Nmspr", "velocity_integral_Nmprad")
     }

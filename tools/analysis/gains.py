@@ -5,8 +5,8 @@
     25, 1.7 and 3 where friction rules the joint)
     phase margin >= margin.min_phase_margin_deg,            every joint of the gate of `run`, one as stiff as under a
     |S| <= margin.max_sensitivity of a soft joint           steady torque, and hardly damped ones: without hysteresis
-    torque noise of the encoders' counts <= a share of limits.torque_max_Nm; of a soft joint LARGEST_NOISE_Nm, some
-                                        0.8 Nm from cycle to cycle
+    torque noise of the encoders' counts <= a share of limits.torque_max_Nm, and what a count does to the torque <= what
+                                        friction and gravity leave of it
 
 The error is that after a step of friction, |G S / w| over all frequencies, and under ripple, which has any frequency as
 the speed changes: |G S / ripple_radps|.  A grid over kv, the observer's bandwidth (or the network's q) and the velocity
@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError, text_Nm
-from jointctl.firmware_py.states import ControllerKind, Encoders
+from jointctl.firmware_py.states import Encoders
 from jointctl.tools.analysis.linear_loop import (
     Array,
     LoopSettings,
@@ -45,7 +45,7 @@ from jointctl.tools.analysis.linear_loop import (
     sampled_joint,
     two_masses,
 )
-from jointctl.tools.analysis.margins import cases, converging, margins_on_grid
+from jointctl.tools.analysis.margins import at_rate, cases, converging, margins_on_grid
 from jointctl.tools.configuration.checks import OBSERVING
 from jointctl.tools.configuration.config import Adaptation, Config, Control
 from jointctl.tools.configuration.conversions import (
@@ -60,13 +60,12 @@ PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 STICKY = (25.0, 1.7, 3.0)  # the same of a joint that friction rules
 STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia: up to the former those above, from the latter on these
 SLIPS = 5.0  # times what kv damps: friction that falls so steeply makes a rigid joint stick and slip at low speed
-NOISE_SHARE = 0.03  # of limits.torque_max_Nm
+NOISE_SHARE, SOFT_NOISE_SHARE = 0.03, 0.55 / 60.0  # of limits.torque_max_Nm; of a soft joint
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
 UNSTABLE = 1e3
 KP_OF_KV = 1.5  # of kv^2, for the law of a flexible joint: with less damping a joint a little different is unstable
 LARGEST_OBSERVER_radps = 110.0  # of that law, for the same reason
-LARGEST_NOISE_Nm = 0.55
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be distinguished from an unstable one
 LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
@@ -88,6 +87,7 @@ USUAL_OBSERVER_radps = 20.0  # of the precise law, where nothing speaks for anot
 UNUSUAL = 0.15  # in the logarithm of the error, at e times that bandwidth or 1/e of it; of the link's filter as well
 RIPPLE_radps = 5.0  # beyond it ripple counts more than the step
 RIPPLE_OF_TWO_radps = 100.0  # docs/law-measured.md: what disturbs such a joint falls with the frequency up to there
+Q_INERTIA_kgm2 = 2.1  # of the joint that the values of lyapunov_q suit
 _LOWEST_Hz, _POINTS = 0.3, 240
 _NEAR = (0.65, 1.3, 120)  # times the believed resonance: from the steady stiffness to the stiffest joint of the gate
 _STARTS, _EVALUATIONS = 3, 90
@@ -120,11 +120,18 @@ class Law:
     kp_of_kv: float
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
-    most_noise_Nm: float = math.inf
+    noise_share: float = NOISE_SHARE
     ripple_radps: float = RIPPLE_radps
     sensitivity: float = SENSITIVITY
     encoders: Encoders | None = None  # of a soft joint, which alone has such a law; None: any joint
     of_soft: tuple[tuple[float, float, int], ...] | None = None  # `spans` of a soft joint, where they are others
+
+    def spans_for(self, config: Config) -> list[tuple[float, float, int]]:
+        """For this joint: what the network adds to the acceleration goes with q over its inertia squared."""
+        spans = self.spans if config.reducer is None or self.of_soft is None else self.of_soft
+        scale = (config.joint.inertia_kgm2 / Q_INERTIA_kgm2) ** 2
+        sizes = [scale if key == "q" else 1.0 for key in self.keys]
+        return [(low * size, high * size, n) for size, (low, high, n) in zip(sizes, spans, strict=True)]
 
     def beyond(self, settings: LoopSettings) -> float:
         """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
@@ -185,7 +192,7 @@ def _highest_link_cutoff_Hz(cutoff_Hz: float) -> float:
 _MOTOR_ENCODER = Law(
     "motor_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
     ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
-    most_noise_Nm=LARGEST_NOISE_Nm, ripple_radps=RIPPLE_OF_TWO_radps, encoders=Encoders.MOTOR,
+    noise_share=SOFT_NOISE_SHARE, ripple_radps=RIPPLE_OF_TWO_radps, encoders=Encoders.MOTOR,
 )  # fmt: skip
 LAWS = {
     "precise": Law(
@@ -204,7 +211,7 @@ LAWS = {
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
         ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, LARGEST_OBSERVER_radps,
-        most_noise_Nm=LARGEST_NOISE_Nm, encoders=Encoders.LINK,
+        noise_share=SOFT_NOISE_SHARE, encoders=Encoders.LINK,
     ),
 }  # fmt: skip
 _FLEXIBLE = {  # by what the law of a flexible joint reads
@@ -249,6 +256,7 @@ class Judged:
     gain_margin: float
     sensitivity: float
     noise_Nm: float
+    step_Nm: float  # of the torque, when an encoder counts one on
     gate_deg: float  # least phase margin of the joints of the gate
     gate_sensitivity: float  # and their largest |S|
     believed: Array = field(compare=False, repr=False)  # closed loop of the joint as it is believed, (states, states)
@@ -265,6 +273,7 @@ class Judged:
 @dataclass(frozen=True)
 class Goals:
     noise_Nm: float
+    step_Nm: float
     gate_deg: float
     gate_sensitivity: float
     phase_margin_deg: float
@@ -281,6 +290,8 @@ class Goals:
             f"kv {one.settings.kv:.2g}, {LEAST_KV_1ps:g} 1/s at least":
                 math.log(max(LEAST_KV_1ps / one.settings.kv, 1.0)),
             f"torque noise {text_Nm(one.noise_Nm, 2)}, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
+            f"one count moves the torque by {text_Nm(one.step_Nm, 2)}, {text_Nm(self.step_Nm, 2)} at most":
+                one.step_Nm / self.step_Nm - 1.0,
             f"phase margin of the gate {one.gate_deg:.1f} of {GRID_SPARE * self.gate_deg:.3g} deg and 3 % to spare":
                 1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
             f"|S| of the gate {one.gate_sensitivity:.2f}, {self.gate_sensitivity / GRID_SPARE:.3g} less 3 % at most":
@@ -419,7 +430,7 @@ class _Search:
         if not all(come_to_rest(alike) for alike in loops):
             worst = max(float(np.max(np.abs(poles_of(alike)))) for alike in loops)
             if worst >= 1.0:
-                return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, UNSTABLE, believed)
+                return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, 0.0, UNSTABLE, believed)
         law = controller.response(self._z)
         open_loops = -np.einsum("fe,jfe->jf", law[:, 0], self._responses)  # joints, frequencies, encoders
         phases, gains, peaks = margins_on_grid(open_loops)
@@ -432,6 +443,7 @@ class _Search:
             settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
             float(np.min(phases[own])), float(np.min(gains[own])), float(np.max(peaks[own])),
             math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
+            float(np.max(np.abs(controller.d[0]) * self._count_rad)),
             float(np.min(phases[gate], initial=90.0)), float(np.max(peaks[gate], initial=1.0)),
             believed,
         )  # fmt: skip
@@ -460,8 +472,7 @@ def choose_gains(
     found = _chosen(ready, law, intervals, loop_settings(ready)[0], objective)
     damped_Nmspr = config.joint.inertia_kgm2 * found.best.settings.kv
     if config.reducer is None and friction_fall_Nmspr(config) > SLIPS * damped_Nmspr:
-        without = {"adaptation": None, "observer_paired": False}
-        return replace(found, control=found.control.model_copy(update=without))
+        return replace(found, control=found.control.model_copy(update={"adaptation": None, "observer_paired": False}))
     return found
 
 
@@ -485,13 +496,15 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     """The search, from the [control] of the configuration."""
     from scipy.optimize import minimize  # here: only a search waits for it
 
-    noise_Nm = min(NOISE_SHARE * config.limits.torque_max_Nm, law.most_noise_Nm)
+    limit_Nm = config.limits.torque_max_Nm
+    left_Nm = limit_Nm - (static_friction_Nm(config) or 0.0) - abs(config.joint.gravity_Nm)
     ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     gate_deg, gate_s = config.margin.min_phase_margin_deg / GRID_SPARE, GRID_SPARE * settings.largest_s
-    goals = Goals(noise_Nm, gate_deg, gate_s, *wanted)
+    step_Nm = GRID_SPARE * (left_Nm if left_Nm > 0.0 else limit_Nm)  # the gate refuses a joint that leaves nothing
+    goals = Goals(law.noise_share * limit_Nm, step_Nm, gate_deg, gate_s, *wanted)
     search = _Search(config, law, intervals, settings)
-    spans = law.spans if config.reducer is None or law.of_soft is None else law.of_soft
+    spans = law.spans_for(config)
 
     def cost(one: Judged, least_error: float | None) -> float:
         if not one.stable:
@@ -561,7 +574,7 @@ def _control(config: Config, control: Control) -> Control:
     }  # fmt: skip
     if observes:
         update["observer_delay_cycles"] = _observed_late(late_s, config)
-        update["learning"] = control.learning or config.control.learning
+        update["learning"] = at_rate(control.learning, config.loop.rate_Hz) or config.control.learning
     return control.model_copy(update=update)
 
 
@@ -572,16 +585,12 @@ def _observed_late(late_s: float, config: Config) -> int:
 
 def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
     """Keys of [control]."""
-    named: dict[str, Any] = {"kp": settings.kp, "kv": settings.kv}
-    if "observer_radps" in law.keys:
-        named["observer_radps"] = settings.observer_radps
-        named["observer_delay_cycles"] = settings.observer_delay_cycles
-    if "cutoff_Hz" in law.keys:
-        named["velocity_cutoff_Hz"] = settings.cutoff_Hz
-    if settings.kind == ControllerKind.FLEXIBLE_JOINT and settings.encoders == Encoders.BOTH:
-        named["link_cutoff_Hz"] = settings.link_cutoff_Hz
-    if "q" in law.keys:
-        named["lyapunov_q"] = settings.q
+    names = {"cutoff_Hz": "velocity_cutoff_Hz", "q": "lyapunov_q"}
+    named: dict[str, Any] = {"kp": settings.kp}
+    for key in law.keys:
+        named[names.get(key, key)] = getattr(settings, key)
+        if key == "observer_radps":
+            named["observer_delay_cycles"] = settings.observer_delay_cycles
     return named
 
 

@@ -34,6 +34,7 @@ from jointctl.tools.configuration.config import Learning
 _ROUND_POINTS = 33  # of a round; an odd number keeps a symmetric extremum on the grid
 
 OBSERVING = tuple(ControllerKind[kind.upper()] for kind in OBSERVING_LAWS)
+LEARNING_RATE_Hz = 1000.0  # for which the cycles of the shipped laws are
 LEARNING_FACTOR = 0.9  # of a repetition, wanted
 SLOWEST_LEARNING_FACTOR = 0.99  # at most: at 1 nothing is learned
 LATE_LEARNING_FACTOR = 0.96  # beyond it the quickest gains that converge do so on the model alone: one step slower
@@ -453,6 +454,17 @@ def slowest_convergence(loops: list[RepeatedLoop], learning: Learning) -> Conver
 def learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
     """The same of the joints that the loop must bear."""
     return slowest_convergence(repeated_loops(settings), learning)
+
+
+def at_rate(learning: Learning | None, rate_Hz: float) -> Learning | None:
+    """Of a shipped law, whose cycles are those of LEARNING_RATE_Hz."""
+    if learning is None:
+        return None
+    faster = rate_Hz / LEARNING_RATE_Hz
+    lead, half_width = (
+        min(round(cycles * faster), 100) for cycles in (learning.lead_cycles, learning.half_width_cycles)
+    )
+    return learning.model_copy(update={"lead_cycles": max(lead, 1), "half_width_cycles": half_width})
 
 
 def converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:

@@ -71,6 +71,9 @@ NOISE_S = 0.25  # that the mean change of the torque command is taken over
 NOISE_OF_RATE = 0.6
 FOLLOWING_SHARE = 0.3  # of the torque limit, that goes at most into the kinematic error of a reducer
 RIPPLE_MOST = 4.0  # of what the adaptation takes for torque ripple, times what is expected
+RIPPLE_SHARE = 0.7 / 60.0  # of limits.torque_max_Nm, that is expected of it
+# what the adaptation cannot explain: of joints of usual size, and the least and most of other ones, static frictions
+UNEXPLAINED_Nm, LEAST_UNEXPLAINED, MOST_UNEXPLAINED = 5.0, 0.2, 4.0
 WARMING_S = 2.0  # in which the friction feed-forward follows a new reading of the temperature
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
@@ -222,9 +225,13 @@ def _fill_adaptation(record: AdaptationConstants, config: Config, adaptation: Ad
     ratio = config.joint.reduction_ratio
     record.enabled = 1
     _fill_velocity(record.seen, config, SEEN_Hz)
-    _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
+    _copy(record, adaptation, "friction_error", "reach")
+    ripple_Nm = adaptation.ripple_Nm
+    record.ripple_Nm = RIPPLE_SHARE * config.limits.torque_max_Nm if isinstance(ripple_Nm, str) else ripple_Nm
     record.count_rad = 0.0 if config.control.kind == "flexible_joint" else law_resolution_rad(config)
-    record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
+    record.ripple_max_Nm = RIPPLE_MOST * record.ripple_Nm
+    static_Nm = static_friction_Nm(config) or UNEXPLAINED_Nm
+    record.noise_Nm = min(max(UNEXPLAINED_Nm, LEAST_UNEXPLAINED * static_Nm), MOST_UNEXPLAINED * static_Nm)
     record.ripples = len(adaptation.ripple_per_motor_turn)
     for i, order in enumerate(adaptation.ripple_per_motor_turn):
         record.ripple_turns_prad[i] = ratio * order / math.tau

@@ -248,14 +248,22 @@ def _too_few(speeds: np.ndarray, knee: float) -> str:
     return f"{low} points up to it and {high} beyond" if min(low, high) < MIN_PER_STAGE else ""
 
 
+class _TooFewBeside(DataError):
+    """Too few points on one side of the knee; `seen` says so without what to do about it."""
+
+    def __init__(self, data: FrictionData, seen: str) -> None:
+        super().__init__(
+            f"{data.path}: {seen}; at least {MIN_PER_STAGE} are needed on both sides",
+            "set --knee, or --search-knee, or --model auto; or the unit or side of the velocity is wrong",
+        )
+        self.seen = seen
+
+
 def _stage_check(data: FrictionData, problem: Problem, word: str) -> None:
     few = _too_few(problem.x, problem.knee) if problem.form.cubic else ""
     if few:
-        raise DataError(
-            f"{data.path}: knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) at {word} velocity: {few}; at "
-            f"least {MIN_PER_STAGE} are needed on both sides",
-            "set --knee, or --search-knee, or --model auto; or the unit or side of the velocity is wrong",
-        )
+        knee_degps = problem.knee * problem.top_radps / DEGREE
+        raise _TooFewBeside(data, f"knee (={knee_degps:.4g} deg/s) at {word} velocity: {few}")
 
 
 def _first_form(data: FrictionData, options: Options, notes: list[str]) -> Form:
@@ -293,7 +301,14 @@ def identify_friction(
     _refuse(data, before.problems)
     notes, warnings = list(data.notes), list(before.warnings)
     first = _first_form(data, options, notes)
-    points, exponent = _weighted_points(data, options, first, warnings)
+    try:
+        points, exponent = _weighted_points(data, options, first, warnings)
+    except _TooFewBeside as error:  # without the outliers
+        if options.model != "auto" or options.search_knee:
+            raise
+        notes.append(f"{error.seen}, too few for the {first.name} model without the outliers, which was left out")
+        first, warnings = FORMS["stribeck"], list(before.warnings)
+        points, exponent = _weighted_points(data, options, first, warnings)
     for word, found in points.items():
         for line, score in zip(data.line[found.outliers], found.score, strict=True):
             notes.append(f"line {line}: outlier at {word} velocity, {abs(score):.1f} standard deviations: not used")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import ConfigurationError, text_Nm
+from jointctl.drivers.errors import ConfigurationError, text_Nm, text_radps
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.analysis.margin_gate import passes
@@ -44,6 +44,7 @@ REACH = 2.5  # times the travel: where the position limits of the check are
 VELOCITY_MAX_radps = 0.5
 COUNTS_IN_VELOCITY = 2.0  # what a coarse encoder may add to it, in steps of its reading
 PEAK = 1.875  # of the velocity over its mean, in a minimum-jerk ramp
+REFERENCE_SHARE = 0.5  # of the velocity limit, that the reference may have
 STATIC_FRICTIONS = 2.0  # torque limit of the check, over the static friction that is configured
 LEAST_FRICTIONS = 1.25  # the same where a soft reducer bears no more
 TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
@@ -86,8 +87,9 @@ class CheckPlan:
 
     @property
     def ramp_s(self) -> float:
-        """Of one ramp: longer travel is no faster."""
-        return RAMP_s * max(1.0, self.travel_rad / TRAVEL_rad)
+        """Of one ramp: longer travel is no faster, nor a joint whose velocity limit is low."""
+        quickest_s = PEAK * self.travel_rad / (REFERENCE_SHARE * self.velocity_radps)
+        return max(RAMP_s * max(1.0, self.travel_rad / TRAVEL_rad), quickest_s)
 
     @property
     def reach_rad(self) -> float:
@@ -195,7 +197,7 @@ class CheckMotion:
             *joint_lines(report, self.config.limits),
             f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
             f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
-            f"limits     {text_Nm(plan.torque_Nm)}, {plan.velocity_radps:.2f} rad/s; it is braked beyond "
+            f"limits     {text_Nm(plan.torque_Nm)}, {text_radps(plan.velocity_radps)}; it is braked beyond "
             f"{plan.reach_rad:.2g} rad to either side: keep it free and unloaded, a hand on the emergency stop",
             "watch      which way it turns first: it must be the one that you call positive",
             *remark_lines(report.remarks),
@@ -238,6 +240,8 @@ _PLUGS_REMEDY = "swap the cables of the two encoders, or which object of the dri
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
 LOOSE = 0.2  # of the way that it came: less may be the bristles of friction that holds it
+HEAVY_radps2 = 3.5  # torque over the inertia, below which a joint moves visibly only long after friction has let it go
+LEAST_OF_HEAVY = 0.25  # of that torque, is friction: the inertia may be believed wrongly
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
@@ -298,8 +302,8 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     return np.convolve(values, np.ones(cycles) / cycles, "valid")
 
 
-def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> Motion | None:
-    """None if the drive was never enabled."""
+def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, inertia_kgm2: float = 0.0) -> Motion | None:
+    """None if the drive was never enabled; without `inertia_kgm2` no joint is taken for a heavy one."""
     rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
     if powered.sum() < 2:
@@ -311,6 +315,13 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
     work = float(np.sum(pushed[:-1] * np.diff(way)))
     loose = np.nonzero(np.abs(way) >= max(threshold_rad, LOOSE * np.abs(way).max()))[0]
     first = int(loose[0]) if len(loose) else -1
+    # a count of a coarse encoder is a kick of many Nm, too short to move anything
+    break_away_Nm = float(np.abs(_smoothed(pushed[: first + 1 or None])).max())
+    if first > 0 and break_away_Nm < HEAVY_radps2 * inertia_kgm2:
+        # by then most of the work has gone into its speed
+        speed = float(np.mean(rows.velocity_radps[max(first - 4, 0) : first + 1]))
+        done_J = float(np.sum(pushed[:first] * np.diff(way[: first + 1]))) - 0.5 * inertia_kgm2 * speed * speed
+        break_away_Nm = min(max(done_J / abs(way[first]), LEAST_OF_HEAVY * break_away_Nm), break_away_Nm)
     smooth, measured = _smoothed(torque), _smoothed(np.asarray(rows.measured_torque_Nm))
     strong = np.abs(smooth) > 0.5 * np.abs(smooth).max()
     ratio = None
@@ -321,7 +332,7 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> M
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        break_away_Nm=float(np.abs(_smoothed(pushed[: first + 1 or None])).max()),
+        break_away_Nm=break_away_Nm,
         torque_max_Nm=float(np.abs(smooth).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
@@ -353,7 +364,7 @@ def motion_findings(
     threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * law_resolution_rad(config))
     # a reading that stands still ends the check before it has stood for long
     held_cycles = 1 if fault is Fault.POSITION_FROZEN else round(HELD_s * config.loop.rate_Hz)
-    motion = motion_of(records, threshold_rad, held_cycles)
+    motion = motion_of(records, threshold_rad, held_cycles, config.joint.inertia_kgm2)
     if motion is None:
         misplaced = fault in (Fault.POSITION_DISAGREEMENT, Fault.POSITION_LIMIT)
         if misplaced and len(records) and records.position_rad[-1]:

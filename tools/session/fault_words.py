@@ -239,8 +239,8 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
     ),
     Fault.POSITION_FROZEN: FaultWords(
         "the position reading stood still although the joint was driven (reference moved by {value:.4f} rad)",
-        "the encoder or its cable is dead, or the joint is blocked",
-        "turn the joint by hand with the power off and watch the position; check the encoder cable",
+        "the encoder or its cable is dead, or the joint is blocked, also by more friction than the loop pushes against",
+        "turn the joint by hand with the power off and watch the position; check its cable; run `jointctl check`",
     ),
     Fault.SUSPENDED: FaultWords(
         "the computer slept for {value:.1f} s while the loop was running",

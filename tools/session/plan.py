@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import Approval, CommissioningReport
-from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, blamed, text_Nm
+from jointctl.drivers.errors import (
+    ConfigurationError,
+    MotionFault,
+    UsageError,
+    blamed,
+    decimals_of,
+    text_Nm,
+    text_radps,
+)
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.records import AxisConstants
@@ -190,7 +198,7 @@ def limits_line(limits: Limits) -> str:
     """Of the envelope of a motion that is followed under all of them."""
     return (
         f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-        f"{limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)}, "
+        f"{text_radps(limits.velocity_max_radps)}, {text_Nm(limits.torque_max_Nm)}, "
         f"following error {limits.following_error_max_rad:.3f} rad"
     )
 
@@ -341,8 +349,8 @@ class ConfiguredMotion:
             f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
             if approach
             else f"approach   none: at once to {first.position_rad:+.4f} rad",
-            f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {speed:.3f} rad/s "
-            f"and {acceleration:.3f} rad/s2{jerk}, {time_text}",
+            f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {text_radps(speed, 3)} "
+            f"and {acceleration:.{decimals_of(acceleration, 3)}f} rad/s2{jerk}, {time_text}",
             limits_line(config.limits),
             *remark_lines(report.remarks),
         ]

@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, DataError, MotionFault, UsageError, text_Nm
+from jointctl.drivers.errors import (
+    INTERRUPTED,
+    ConfigurationError,
+    DataError,
+    MotionFault,
+    UsageError,
+    text_Nm,
+    text_radps,
+)
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, TrajectoryKind
@@ -378,7 +386,7 @@ class SweepPass:
             f"motion     {middle + motion.low_rad:+.3f} .. {middle + motion.high_rad:+.3f} rad, back and forth, "
             f"about {_duration_text(total_s)}; points that do not settle are visited once more",
             f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-            f"{limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)}",
+            f"{text_radps(limits.velocity_max_radps)}, {text_Nm(limits.torque_max_Nm)}",
             *remark_lines((*own, *constant_remarks(config), *report.remarks)),
         ]
 

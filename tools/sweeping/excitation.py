@@ -22,7 +22,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
 from jointctl.tools.identification.models import EXPERIMENTS, FORMS, SIGNS, Model, Samples, jacobian
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
@@ -34,6 +34,7 @@ from jointctl.tools.sweeping.plan import (
     MotionBuilder,
     PlanSettings,
     SweepMotion,
+    fastest_allowed_radps,
     position_margin_rad,
     require_torque,
     shifted,
@@ -52,8 +53,10 @@ EASE_S = 2.0  # in which the sines come and go
 ROW_S = 0.01
 FASTEST_SHARE = (0.3, 1.0)  # of what the limits allow
 TORQUE_SHARE = 0.8  # of limits.torque_max_Nm that the motion may need
+SPARE_SHARE = 0.5  # of what gravity and friction leave of it, where they take more than that
 ERROR, CORRELATED_s = 0.1, 0.1  # of the Coulomb friction; ripple and noise of a usual joint
 OPEN = 0.5  # half the interval over the value from which on a parameter counts as not found
+OVERLOADED = "a greater limits.torque_max_Nm; or [friction] and joint.gravity_Nm are of another joint"
 _SAMPLE_s = 0.02
 _ASSUMED_LOAD = {"load_coulomb": 0.1, "load_viscous": 0.05}  # of a usual strain-wave gear
 _FRICTION_SHARE, _STRIBECK_radps = 0.05, 0.03  # of limits.torque_max_Nm; where no friction is configured
@@ -116,28 +119,34 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     limits = config.limits
     margin_rad = position_margin_rad(config)
     width_rad = limits.position_max_rad - limits.position_min_rad - 2.0 * margin_rad
-    fastest = SPEED_SHARE * limits.velocity_max_radps
+    fastest = fastest_allowed_radps(config)
     settings = PlanSettings(
         width_rad, ACCELERATION_SHARE * config.sequence.brake_radps2, fastest, 1.0, 0.0, config.joint.reduction_ratio
     )
     model, vector = believed(config)
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
     slowest = _slowest_radps(model, vector)
+    left_Nm = limits.torque_max_Nm - (static_friction_Nm(config) or 0.0) - abs(config.joint.gravity_Nm)
+    usual_Nm = TORQUE_SHARE * limits.torque_max_Nm
+    most_Nm = max(usual_Nm, limits.torque_max_Nm - SPARE_SHARE * left_Nm) if left_Nm > 0.0 else usual_Nm
     best: Design | None = None
+    best_strong: Design | None = None  # of those that need more than usual
     for number in range(CANDIDATES):
         random = np.random.default_rng([seed, number])
         slower = replace(settings, transit_radps=fastest * float(random.uniform(*FASTEST_SHARE)))
         motion = _candidate(slower, slowest, duration_s, random)
         found = _judged(motion, middle, slowest, model, vector)
-        if np.max(np.abs(found.torque_Nm)) > TORQUE_SHARE * limits.torque_max_Nm:
-            continue
-        if best is None or found.condition < best.condition:
+        needed_Nm = float(np.max(np.abs(found.torque_Nm)))
+        if needed_Nm <= usual_Nm and (best is None or found.condition < best.condition):
             best = found
+        elif usual_Nm < needed_Nm <= most_Nm and (best_strong is None or found.condition < best_strong.condition):
+            best_strong = found
+    best = best or best_strong
     if best is None:
         raise UsageError(
             f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must leave room for gravity, friction and the "
             f"acceleration of the motion ({settings.acceleration_radps2:g} rad/s2 at most)",
-            "lower sequence.brake_radps2",
+            "lower sequence.brake_radps2" if left_Nm > 0.0 else OVERLOADED,
         )
     return best
 

@@ -26,7 +26,11 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
 from jointctl.tools.analysis.loop_report import rated_contradiction
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import (
+    joint_rad_per_count,
+    torque_constant_NmpA,
+    velocity_of_a_count_radps,
+)
 from jointctl.tools.sweeping.options import (
     DEFAULT_POINTS,
     SPEED_RATIO,
@@ -68,7 +72,9 @@ class PlanSettings:
 
     @property
     def motor_period_rad(self) -> float:
-        return math.tau / (self.ripple_per_motor_turn * self.reduction_ratio)
+        """Of the finest ripple; a direct drive has none that repeats more often than that of the joint."""
+        period_rad = math.tau / (self.ripple_per_motor_turn * self.reduction_ratio)
+        return period_rad if period_rad <= self.joint_period_rad else self.joint_period_rad / TEETH
 
 
 @dataclass(frozen=True)
@@ -297,7 +303,7 @@ def shifted(motion: SweepMotion, middle_rad: float) -> SweepMotion:
 
 # --- the plan that follows from the options, for a joint ---
 
-SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
+SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have, and a count of the encoder less
 ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
 TRANSIT_SHARE = 0.5  # of the fastest plateau, for ways without measuring
 SETTLE_S = 0.3
@@ -327,14 +333,19 @@ def position_margin_rad(config: Config) -> float:
     return config.limits.following_error_max_rad
 
 
+def fastest_allowed_radps(config: Config) -> float:
+    """That no reading of it is beyond limits.velocity_max_radps: the speed of a coarse encoder jumps by a count."""
+    fastest = config.limits.velocity_max_radps
+    return min(SPEED_SHARE * fastest, max(fastest - velocity_of_a_count_radps(config), 0.5 * fastest))
+
+
 def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
     """Check the options against the joint and plan; `UsageError` in one line."""
     check_options(options)
-    limits = config.limits
     width = _width_rad(config, options)
     wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
     dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
-    allowed = SPEED_SHARE * limits.velocity_max_radps
+    allowed = fastest_allowed_radps(config)
 
     def settings(transit_radps: float) -> PlanSettings:
         return PlanSettings(
@@ -347,10 +358,10 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
         assert options.speeds is not None
         velocities = listed_velocities(options.speeds)
         fastest = max(abs(v) for v in velocities)
-        _check_fastest(f"fastest speed of {options.speeds}", fastest, reachable, allowed)
+        _check_fastest(config, f"fastest speed of {options.speeds}", fastest, reachable)
     else:
         fastest = options.max_speed_radps or reachable
-        _check_fastest("--max-speed", fastest, reachable, allowed)
+        _check_fastest(config, "--max-speed", fastest, reachable)
         slowest = options.min_speed_radps or fastest / (QUICK_RATIO if options.quick else SPEED_RATIO)
         if not slowest < fastest:
             raise UsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
@@ -387,9 +398,11 @@ def _width_rad(config: Config, options: SweepOptions) -> float:
     return min((2.0 * min(place - low, high - place) for place in options.places_rad or ()), default=high - low)
 
 
-def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) -> None:
+def _check_fastest(config: Config, name: str, fastest: float, reachable: float) -> None:
     if fastest > reachable * (1.0 + 1e-9):
-        why = f"{SPEED_SHARE:.0%} of limits.velocity_max_radps" if reachable == allowed else "what the travel allows"
+        allowed = fastest_allowed_radps(config)
+        share = f"{allowed / config.limits.velocity_max_radps:.0%} of limits.velocity_max_radps"
+        why = share if reachable == allowed else "what the travel allows"
         raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")
 
 

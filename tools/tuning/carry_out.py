@@ -51,7 +51,6 @@ from jointctl.tools.tuning.frequency_response import (
     ResponseLaw,
     ResponseMotion,
     ResponsePlan,
-    SPEED_radps,
     config_of_response,
     grown,
     largest_peak_Nm,
@@ -369,7 +368,7 @@ def task_by(law: str, before: Config, legs: int, torque_Nm: float | None = None)
     static_Nm = static_friction_Nm(before) or 0.0
     if law != ALONE and static_Nm > 0.0:
         fed_Nm = FED_SHARE * static_Nm
-        before = with_sliding(before, static_Nm, (fed_Nm, -fed_Nm), 0.0, SPEED_radps)
+        before = with_sliding(before, static_Nm, (fed_Nm, -fed_Nm), 0.0, speed_and_period(before)[0])
     return response_task(before, torque_Nm, legs, _LAWS.get(law, WEAK))
 
 

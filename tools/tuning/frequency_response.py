@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import DataError, UsageError, text_Nm
+from jointctl.drivers.errors import DataError, UsageError, text_Nm, text_radps
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 
 SPEED_radps = 0.2  # of the triangle: at 0.05 friction still hides what is looked for
-LEAST_SPEED_radps = 0.1
+USUAL_SPEED_radps = 0.1  # at least, where travel and limits.velocity_max_radps allow it
+LEAST_SPEED_radps = 0.01
 SPEED_SPREAD = 0.2  # by which a pair of legs is faster or slower
 VELOCITY_SHARE = 0.4  # of limits.velocity_max_radps: the excitation adds to the speed
 ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2
@@ -61,7 +62,8 @@ LEAST_SHARE = 1.0 / 8.0  # of that peak: where it begins
 SEED = 1
 FRICTION_SPARE = 1.2  # of the static friction, which the excitation leaves room for
 
-LARGEST_radps2 = 8.0  # that peak over the inertia: more would turn a light joint round, and its friction with it
+# that peak over the inertia, less below USUAL_SPEED_radps: more would turn the motion round, and its friction with it
+LARGEST_radps2 = 8.0
 
 
 class ResponseLaw(NamedTuple):
@@ -135,18 +137,19 @@ def speed_and_period(config: Config) -> tuple[float, float]:
     """(speed of the triangle, period of the multisine) that the travel allows; `UsageError` where it is too short."""
     acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
     width = room_rad(config)
-    for length_s, least in ((PERIOD_s, 0.7 * SPEED_radps), (SHORT_PERIOD_s, LEAST_SPEED_radps)):
-        speed = min(SPEED_radps, VELOCITY_SHARE * config.limits.velocity_max_radps)
-        while speed >= least:
+    fastest = min(SPEED_radps, VELOCITY_SHARE * config.limits.velocity_max_radps)
+    wanted = ((PERIOD_s, 0.7 * SPEED_radps), (SHORT_PERIOD_s, USUAL_SPEED_radps), (SHORT_PERIOD_s, LEAST_SPEED_radps))
+    for length_s, least in wanted:
+        speed = fastest
+        while speed >= min(least, max(fastest, LEAST_SPEED_radps)):
             if _length_rad((1.0 + SPEED_SPREAD) * speed, length_s, acceleration) <= width:
                 return speed, length_s
             speed *= 0.98
     needed = _length_rad((1.0 + SPEED_SPREAD) * LEAST_SPEED_radps, SHORT_PERIOD_s, acceleration)
-    fastest = VELOCITY_SHARE * config.limits.velocity_max_radps
     raise UsageError(
         f"the travel (={width:.4g} rad) must be at least {needed:.3g} rad, and {VELOCITY_SHARE:g} of "
-        f"limits.velocity_max_radps (={fastest:.3g} rad/s) at least {LEAST_SPEED_radps:g}: the joint has to slide; "
-        "see limits.position_min_rad, position_max_rad"
+        f"limits.velocity_max_radps (={VELOCITY_SHARE * config.limits.velocity_max_radps:.3g} rad/s) at least "
+        f"{LEAST_SPEED_radps:g}: the joint has to slide; see limits.position_min_rad, position_max_rad"
     )
 
 
@@ -217,7 +220,8 @@ def largest_peak_Nm(config: Config) -> float:
             f"the torque (={limit:g} Nm) must be more than {holds * 1.05:.3g} Nm, what friction and gravity of the "
             "configuration take: --torque, limits.torque_max_Nm"
         )
-    return min(peak, LARGEST_radps2 * config.joint.inertia_kgm2)
+    slower = min(speed_and_period(config)[0] / USUAL_SPEED_radps, 1.0)
+    return min(peak, LARGEST_radps2 * slower * config.joint.inertia_kgm2)
 
 
 def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw | None = WEAK) -> Config:
@@ -300,7 +304,7 @@ class ResponseMotion:
             *joint_lines(report, config.limits),
             f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
             f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
-            f"{top:.2f} rad/s, {duration_s:.0f} s",
+            f"{text_radps(top)}, {duration_s:.0f} s",
             f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
             f"{'at first ' if more else ''}{text_Nm(plan.peak_Nm, 2)} on top of what the motion takes"
             f"{f'{then}, about 2 minutes in all' if more else ''}",

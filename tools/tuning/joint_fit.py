@@ -366,6 +366,7 @@ def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
 LEAST_SHARE = 0.025  # of the friction: less is no gravity
 SURE = 4.0  # standard errors
 BLOCK_rad = 0.1  # of the way, one independent value each
+LEAST_WAY_rad = 0.3  # a shorter one does not tell gravity from friction that goes with the angle
 
 
 @dataclass(frozen=True)
@@ -390,20 +391,25 @@ def gravity_of(plan: ResponsePlan, records: Any, period_s: float, zero_rad: floa
     without lever is the configured `zero_rad`.
     """
     cycle = np.round(np.asarray(records.trajectory_s) / period_s).astype(int)
-    position, torque, sides = [], [], []
+    position, torque, sides, ways, held = [], [], [], [], []
     for start in plan.legs.starts:
         first, last = np.searchsorted(cycle, (start, start + plan.samples))
         rows = records[first:last]
         if len(rows) < 0.99 * plan.samples:
             continue
         way = abs(float(rows.position_rad[-1] - rows.position_rad[0]))
+        ways.append(way)
         excitation = plan.peak_Nm * plan.sine.wave[np.asarray(cycle[first:last]) % plan.samples]
         for part in np.array_split(np.arange(len(rows)), max(round(way / BLOCK_rad), 2)):
             position.append(float(np.mean(rows.position_rad[part])))
             torque.append(float(np.mean(rows.command_torque_Nm[part] - excitation[part])))
+            held.append(float(np.mean(rows.gravity_torque_Nm[part])))
             sides.append(math.copysign(1.0, rows.desired_velocity_radps[part[0]]))
     angle, side = np.array(position) - zero_rad, np.array(sides)
     constant = np.column_stack((side > 0.0, side < 0.0)).astype(float)
+    if max(ways, default=0.0) < LEAST_WAY_rad:
+        sliding, _ = _fitted(constant, np.array(torque) - np.array(held))
+        return Gravity(0.0, 0.0, zero_rad, (float(sliding[0]), float(sliding[1])))
     both, spread = _fitted(np.column_stack((constant, np.sin(angle), np.cos(angle))), np.array(torque))
     if abs(both[3]) > SURE * spread[3]:
         size = math.hypot(both[2], both[3])

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import LimitCycle, text_Nm
+from jointctl.drivers.errors import LimitCycle, text_Nm, text_radps
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.config import Config
@@ -48,6 +48,9 @@ Array = NDArray[np.float64]
 # --- The motion ---
 
 STRETCHES_rad = (0.06, 0.04, 0.09, 0.13)  # of the spring at the static friction: the first that the gate allows
+# of the stretch: of a coarser encoder four counts, within which a reading stands, are places apart
+COARSEST_COUNT = 0.02
+SLOWEST_radps = 6.0  # of that spring with the joint's inertia: it must be quicker than what follows
 DAMPING = 0.7
 CUTOFF_OVER_LOOP = 4.0  # of the velocity: a count of a coarse encoder must not kick the joint
 TORQUE_SHARE = 1.6  # of the static friction, which the motion may take
@@ -130,7 +133,7 @@ class PreslidingMotion:
             *joint_lines(report, limits),
             f"motion     a soft spring pushes the joint to and fro with {text_Nm(AMPLITUDE * self.static_Nm, 2)}, "
             f"while it stands, at places from {start_rad:+.3f} to {start_rad + way_rad:+.3f} rad, {self.seconds:.0f} s",
-            f"limits     {text_Nm(limits.torque_max_Nm)}, {limits.velocity_max_radps:.2f} rad/s",
+            f"limits     {text_Nm(limits.torque_max_Nm)}, {text_radps(limits.velocity_max_radps)}",
             *remark_lines(report.remarks),
         ]
         return Placed(constants, table, tuple(lines))
@@ -146,8 +149,11 @@ def presliding_motion(config: Config) -> PreslidingMotion | None:
         return None
     sides = (config.friction.positive, config.friction.negative)
     rests_at = [min(max(abs(one.tc_Nm / one.ts_Nm), LEAST_REST), MOST_REST) for one in sides]
-    for stretch_rad in STRETCHES_rad:
+    heavy_rad = static_Nm / config.joint.inertia_kgm2 / SLOWEST_radps**2
+    for stretch_rad in STRETCHES_rad if heavy_rad >= max(STRETCHES_rad) else (min(heavy_rad, STRETCHES_rad[0]),):
         if REACH * stretch_rad > MOST_OF_ROOM * room_rad(config):
+            continue
+        if law_resolution_rad(config) > COARSEST_COUNT * stretch_rad:
             continue
         kp_ps2 = static_Nm / stretch_rad / config.joint.inertia_kgm2
         loop_radps = math.sqrt(kp_ps2)
@@ -333,7 +339,7 @@ def measured_bristles(config: Config, carrier: Carrier) -> dict[str, Any]:
     """
     motion = presliding_motion(config)
     if motion is None or config.friction is None:
-        return {"why": "the travel is too short, or no spring keeps the margin"}
+        return {"why": "the travel is too short, the encoder too coarse, or no spring keeps the margin"}
     try:
         records = carrier.run(motion.config, motion, "bristles").records
     except LimitCycle as error:

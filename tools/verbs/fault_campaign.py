@@ -167,7 +167,7 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
     from jointctl.tools.experiments.fault_scenarios import PlacedSweep, placed_sweep
     from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan
     from jointctl.tools.tuning.carry_out import LEAST_LEGS, response_task
-    from jointctl.tools.tuning.frequency_response import SPEED_radps, motor_fed
+    from jointctl.tools.tuning.frequency_response import motor_fed, speed_and_period
     from jointctl.tools.tuning.presliding import presliding_motion
 
     # what the step of the direction finds, on this joint
@@ -177,9 +177,10 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
     if step.name == "friction":
         if config.friction is not None:  # and what the response adds
             curve = friction_constants(config.friction, config.joint.reduction_ratio)
-            at_radps = np.array([SPEED_radps, -SPEED_radps])
+            speed_radps, _ = speed_and_period(config)
+            at_radps = np.array([speed_radps, -speed_radps])
             sliding = config.joint.reduction_ratio * friction_curve_Nm(curve, at_radps)
-            unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0, SPEED_radps)
+            unknown = with_sliding(config, static_Nm, (float(sliding[0]), float(sliding[1])), 0.0, speed_radps)
         return placed_sweep(unknown, joint, step.strokes, start_rad)
     pushed = presliding_motion(config) if step.name == "bristles" and config.reducer is None else None
     if pushed is not None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
     from jointctl.tools.configuration.config import Config
 
-SPEED_radps = 0.03
+SPEED_radps = 0.03  # where limits.velocity_max_radps allows it
 LONGEST_rad = 0.7  # of the travel, unless more is asked for, or that is less than LEAST_TURNS of the motor
 LEAST_TURNS = 4.0
 SPEED_SHARE = 0.5  # of limits.velocity_max_radps
@@ -39,8 +39,9 @@ class MapOptions:
         typer.Option("--travel", metavar="RAD", help="about the middle of the limits (what they allow, 0.7)"),
     ] = None
     speed_radps: Annotated[
-        float, typer.Option("--speed", metavar="RAD/S", help="slow, but faster than the joint sticks")
-    ] = SPEED_radps
+        float | None,
+        typer.Option("--speed", metavar="RAD/S", help="slow, but faster than the joint sticks (what they allow, 0.03)"),
+    ] = None
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
 
 
@@ -56,6 +57,11 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     turn_rad = math.tau / config.joint.reduction_ratio
     longest_rad = max(LONGEST_rad, LEAST_TURNS * turn_rad)
     travel_rad = min(width_rad, longest_rad) if options.travel_rad is None else options.travel_rad
+    if width_rad < LEAST_TURNS * turn_rad:
+        raise UsageError(
+            f"limits.position_min_rad and position_max_rad leave {max(width_rad, 0.0):.4g} rad for the motion: a map "
+            f"takes {LEAST_TURNS * turn_rad:.4g} rad, {LEAST_TURNS:g} motor turns"
+        )
     if not LEAST_TURNS * turn_rad <= travel_rad <= width_rad:
         raise UsageError(
             f"--travel (={travel_rad:.4g}) must be in [{LEAST_TURNS * turn_rad:.4g}..{width_rad:.4g}] rad: "
@@ -63,14 +69,15 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
         )
     fastest = SPEED_SHARE * limits.velocity_max_radps
     slowest = travel_rad / _LONGEST_LEG_s
-    if not slowest <= options.speed_radps <= fastest:
-        raise UsageError(f"--speed (={options.speed_radps:g}) must be in [{slowest:.3g}..{fastest:g}] rad/s")
+    speed_radps = speeds_in_turn(config)[0] if options.speed_radps is None else options.speed_radps
+    if not slowest <= speed_radps <= fastest:
+        raise UsageError(f"--speed (={speed_radps:g}) must be in [{slowest:.3g}..{fastest:g}] rad/s")
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
     acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
-    leg_s = travel_rad / options.speed_radps + options.speed_radps / acceleration + _DWELL_S
+    leg_s = travel_rad / speed_radps + speed_radps / acceleration + _DWELL_S
     motion = Trapezoid(
         kind="trapezoid", duration_s=round(2.0 * leg_s, 3), start_rad=middle - 0.5 * travel_rad,
-        target_rad=middle + 0.5 * travel_rad, speed_radps=options.speed_radps, acceleration_radps2=acceleration,
+        target_rad=middle + 0.5 * travel_rad, speed_radps=speed_radps, acceleration_radps2=acceleration,
         dwell_s=_DWELL_S, repeat=True,
     )  # fmt: skip
     torque = with_tracking_law(with_mode(config, "torque"))
@@ -80,7 +87,7 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
 def speeds_in_turn(config: Config) -> list[float]:
     """[rad/s] for a map that nobody chose a speed for: the next where the joint swings at one."""
     fastest = SPEED_SHARE * config.limits.velocity_max_radps
-    return [speed for speed in (SPEED_radps, 2.0 * SPEED_radps, 4.0 * SPEED_radps) if speed <= fastest] or [SPEED_radps]
+    return [speed for speed in (SPEED_radps, 2.0 * SPEED_radps, 4.0 * SPEED_radps) if speed <= fastest] or [fastest]
 
 
 def map_run(config: Config, records: np.recarray, late_s: float) -> MapRun:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jointctl.tools.sweeping.plan import PlanSettings
 
 RELATIVE_TOLERANCE = 0.01
+SHORT_TOLERANCE = 0.03  # where the travel is shorter than a ripple period of the joint, which cannot be averaged out
 REVISITS = 1  # of points that did not settle, with REVISIT_DWELL times the dwell
 REVISIT_DWELL = 3.0
 
@@ -187,7 +188,9 @@ class Sweep:
 
         def begin(report: CommissioningReport) -> None:
             resolution_Nm = report.torque_resolution_Nm / config.joint.reduction_ratio
-            meter.tolerance = Tolerance(RELATIVE_TOLERANCE, 0.5 * resolution_Nm)
+            settings = self.plan.settings
+            short = settings.width_rad < settings.joint_period_rad
+            meter.tolerance = Tolerance(SHORT_TOLERANCE if short else RELATIVE_TOLERANCE, 0.5 * resolution_Nm)
             if self.file is None:
                 constant, ratio = torque_constant_NmpA(config), config.joint.reduction_ratio
                 self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError, text_Nm
+from jointctl.drivers.errors import ConfigurationError, text_Nm, text_radps
 from jointctl.tools.analysis.gains import ChosenGains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
@@ -18,7 +18,7 @@ from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.tuning.carry_out import SWEEP_SHARE, VERIFY_s, response_task
-from jointctl.tools.tuning.frequency_response import bode_figure
+from jointctl.tools.tuning.frequency_response import bode_figure, speed_and_period
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text
 from jointctl.tools.verbs.map import speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS, fit_table
@@ -44,15 +44,16 @@ def envelope(job: Tune) -> list[str]:
     return [
         f"tune       {output}, law {job.options.law}, objective {job.options.objective}",
         "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
-        f"response   triangle at 0.2 rad/s within {inside}, multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
-        f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
+        f"response   triangle at {text_radps(speed_and_period(task.config)[0], 1)} within {inside}, "
+        f"multisine up to {text_Nm(task.largest_Nm)}, 2 minutes",
+        f"friction   plateaus of constant speed within {inside}, up to {text_radps(top_radps)}, about 4 minutes",
         "bristles   a soft spring pushes the joint to and fro while it stands, at places within 0.2 rad, about a "
         "minute, where the joint is rigid",
         f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft"
         + (f"; at up to {slowly[-1]:g} where it swings" if slowly[1:] else ""),
         f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
         "and after it half a minute of the response, for a joint that has changed",
-        f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {text_Nm(limits.torque_max_Nm)} in every "
+        f"limits     {inside}, {text_radps(limits.velocity_max_radps)}, {text_Nm(limits.torque_max_Nm)} in every "
         "step; keep the joint free and unloaded, a hand on the emergency stop",
     ]
 

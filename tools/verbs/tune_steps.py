@@ -78,9 +78,9 @@ from jointctl.tools.tuning.carry_out import (
 )
 from jointctl.tools.tuning.frequency_response import (
     FrequencyResponse,
-    SPEED_radps,
     from_dict,
     motor_fed,
+    speed_and_period,
     with_torque_limit,
 )
 from jointctl.tools.tuning.joint_fit import (
@@ -272,15 +272,15 @@ class Tune:
 
         And a quick observer hunts there.
         """
-        config = self._before_friction()
-        if self.fit is None:
+        config, fit = self._before_friction(), self.fit
+        if fit is None:
             return config
-        config = with_slow_observer(config, self.fit.intervals(), SWEEP_OBSERVER_radps)
+        config = with_slow_observer(config, fit.intervals(), SWEEP_OBSERVER_radps)
         static_Nm, kept = static_friction_Nm(config), self.state["response"]["gravity"]
         if static_Nm is None or "sliding_Nm" not in kept:
             return config
-        positive_Nm, negative_Nm = kept["sliding_Nm"]
-        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), self.fit.friction_Nmspr.value, SPEED_radps)
+        (positive_Nm, negative_Nm), (speed_radps, _) = kept["sliding_Nm"], speed_and_period(config)
+        return with_sliding(config, static_Nm, (positive_Nm, negative_Nm), fit.friction_Nmspr.value, speed_radps)
 
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])

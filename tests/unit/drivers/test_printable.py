@@ -17,6 +17,7 @@ from jointctl.drivers.errors import (
     printable,
     shortened,
     text_Nm,
+    text_radps,
 )
 from jointctl.tools.configuration.config import ConfigurationProblems
 
@@ -121,3 +122,8 @@ def test_a_message_ends_somewhere() -> None:
 def test_torques_of_small_joints_keep_digits_that_count(torque_Nm: float, text: str) -> None:
     """A joint of 0.25 Nm was said to be limited to 0.2 Nm."""
     assert text_Nm(torque_Nm) == text
+
+
+@pytest.mark.parametrize(("speed_radps", "text"), [(1.0, "1.00 rad/s"), (0.05, "0.050 rad/s"), (4e-3, "0.0040 rad/s")])
+def test_slow_speeds_keep_digits_that_count(speed_radps: float, text: str) -> None:
+    assert text_radps(speed_radps) == text

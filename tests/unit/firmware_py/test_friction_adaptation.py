@@ -69,7 +69,7 @@ def law() -> Any:
     constants.observer.bandwidth_radps = 60.0
     own = constants.adaptation
     own.enabled, own.ripples, own.friction_error, own.reach = 1, 1, 0.15, 0.3
-    own.ripple_Nm, own.ripple_max_Nm = 0.7, 2.8
+    own.ripple_Nm, own.ripple_max_Nm, own.noise_Nm = 0.7, 2.8, 5.0
     own.ripple_turns_prad[0] = ORDER * RATIO / math.tau
     return constants
 

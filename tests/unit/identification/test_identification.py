@@ -185,6 +185,18 @@ def test_few_points_beyond_the_knee_neither_bend_the_curve_nor_count_as_noise(be
         assert len(found.directions[direction].outliers) == 3 * bends
 
 
+def test_outliers_beyond_the_knee_leave_out_the_multi_stage_model_and_end_nothing():
+    """A direct drive under gravity: a tune of seven minutes ended, and the hint was the model that it had chosen."""
+    speeds = np.concatenate([np.linspace(0.3, 39.0, 24), [43.0, 47.0, 52.0, 56.0, 60.0]]) * DEGREE
+    data = paper_data(0, np.concatenate([-speeds[::-1], speeds]))
+    data.motor_torque_Nm[-3] += 0.1
+    found = identify_friction(data, Options(model="auto", folds=4, swarm=QUICK.swarm))
+    assert any("24 points up to it and 2 beyond, too few for the multi-stage model without" in n for n in found.notes)
+    assert found.model == "stribeck"
+    with pytest.raises(DataError, match="24 points up to it and 2 beyond; at least 5 are needed on both sides"):
+        identify_friction(data, Options(model="multi-stage", folds=4, swarm=QUICK.swarm))
+
+
 def test_a_searched_knee_is_told_and_not_worse():
     searched = identify_friction(paper_data(0), Options(folds=4, search_knee=True, swarm=SwarmSettings(400, 400)))
     assert searched.rmse_Nm <= identify_friction(paper_data(0), QUICK).rmse_Nm * (1.0 + 1e-6)

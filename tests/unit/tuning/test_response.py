@@ -39,6 +39,7 @@ from jointctl.tools.tuning.frequency_response import (
     Channel,
     FrequencyResponse,
     ResponsePlan,
+    SHORT_PERIOD_s,
     SPEED_radps,
     config_of_response,
     excitation_table,
@@ -143,9 +144,11 @@ def test_every_leg_holds_one_period_at_constant_speed_within_the_travel() -> Non
 
 
 def test_a_joint_that_cannot_slide_or_has_no_torque_is_refused() -> None:
-    narrow = shipped("precise", limits__position_min_rad=-0.2, limits__position_max_rad=0.2)
-    with pytest.raises(UsageError, match=r"the travel \(=0.2 rad\) must be at least"):
+    narrow = shipped("precise", limits__position_min_rad=-0.11, limits__position_max_rad=0.11)
+    with pytest.raises(UsageError, match=r"the travel \(=0.02 rad\) must be at least"):
         speed_and_period(narrow)
+    with pytest.raises(UsageError, match=r"limits.velocity_max_radps \(=0.008 rad/s\) at least 0.01"):
+        speed_and_period(shipped("precise", limits__velocity_max_radps=0.02))
     with pytest.raises(UsageError, match=r"--torque \(=61\) must be in \(0..60\]"):
         config_of_response(shipped("precise"), 61.0)
     weak = config_of_response(shipped("precise"), 15.0)
@@ -242,6 +245,19 @@ def test_gravity_is_what_both_directions_have_in_common(gravity_Nm: float) -> No
     assert found.torque_Nm == pytest.approx(gravity_Nm, abs=0.1)
     assert found.found == (gravity_Nm != 0.0)
     assert found.zero_rad == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("held_Nm", [0.0, 3.0])
+def test_a_way_too_short_to_tell_gravity_has_none_and_friction_without_what_is_believed(held_Nm: float) -> None:
+    """80 Nm were found on a joint of 30 Nm that has none: friction that goes with the angle looks like gravity."""
+    config = shipped("precise", limits__position_min_rad=-0.2, limits__position_max_rad=0.2)
+    made = ResponsePlan(legs_of(config, 4), multisine(1.0 / T, SHORT_PERIOD_s), 1.0)
+    log = records_of(made, RIGID)
+    log.command_torque_Nm = 2.0 * np.sign(made.legs.velocity_radps) + held_Nm + 0.3 * np.sin(18.0 * log.position_rad)
+    log.gravity_torque_Nm = held_Nm
+    found = gravity_of(made, log, T, 0.1)
+    assert (found.found, found.torque_Nm, found.zero_rad) == (False, 0.0, 0.1)
+    assert found.sliding_Nm == pytest.approx((2.0, -2.0), abs=0.3)
 
 
 @pytest.mark.parametrize("size", [1.0, 0.01, 40.0])

@@ -1,0 +1,234 @@
+"""From a finger to a base joint: what is derived from a joint suits its torque, inertia, speed, travel and encoder."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import UsageError
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.analysis.gains import BELIEVED, choose_gains
+from jointctl.tools.analysis.linear_loop import loop_settings
+from jointctl.tools.analysis.margin_gate import refuse_chatter
+from jointctl.tools.configuration.config import Adaptation, Config
+from jointctl.tools.configuration.conversions import static_friction_Nm
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.inspection.health import PROBLEM
+from jointctl.tools.inspection.motion_check import PEAK, TRAVEL_rad, config_of_check, make_plan
+from jointctl.tools.sweeping.excitation import designed
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.sweeping.plan import make_plan as sweep_plan
+from jointctl.tools.tuning.frequency_response import (
+    VELOCITY_SHARE,
+    LARGEST_radps2,
+    USUAL_SPEED_radps,
+    config_of_response,
+    largest_peak_Nm,
+    speed_and_period,
+)
+from jointctl.tools.tuning.presliding import presliding_motion
+from jointctl.tools.verbs.map import MapOptions, config_of_map
+from jointctl.tools.virtual_joint import device_settings
+from tests.configurations import shipped
+from tests.unit.inspection.test_motion_check import checked
+
+TORQUES = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
+TABLE_3_Nm = 121.0 * 0.1575  # static friction of the shipped joint
+
+
+class Size(NamedTuple):
+    torque_Nm: float
+    inertia_kgm2: float
+    ratio: float
+    friction_Nm: float  # static
+    speed_radps: float
+    travel_rad: float  # to each side
+    bits: int = 19
+    rate_Hz: float = 1000.0
+    gravity_Nm: float = 0.0
+
+
+SIZES = {
+    "finger": Size(0.3, 2e-4, 50.0, 0.056, 8.0, 0.8, 16),
+    "short finger": Size(0.3, 1e-3, 100.0, 0.05, 3.0, 0.15),
+    "wrist": Size(5.0, 0.05, 80.0, 0.6, 3.0, 1.5, 17, gravity_Nm=4.0),
+    "short elbow": Size(30.0, 0.5, 50.0, 5.0, 1.0, 0.15, 17),
+    "direct drive": Size(20.0, 0.1, 1.0, 0.25, 20.0, 3.0, 20),
+    "base": Size(1000.0, 300.0, 160.0, 100.0, 0.5, 2.0, 20),
+    "slow base": Size(1000.0, 300.0, 200.0, 187.0, 0.05, 1.0, 24, 500.0),
+    "loaded base": Size(300.0, 60.0, 120.0, 25.0, 1.0, 1.0, 21, 250.0, 210.0),
+}
+
+
+def joint(size: Size, **more: Any) -> Config:
+    """The shipped one at this size; it is in truth as it is believed."""
+    config, factor = shipped("precise"), size.friction_Nm / TABLE_3_Nm
+    assert config.friction is not None
+    curve = {
+        f"friction__{side}": branch.model_copy(
+            update={name: getattr(branch, name) * factor * 121.0 for name in TORQUES}
+        )
+        for side, branch in (("positive", config.friction.positive), ("negative", config.friction.negative))
+    }
+    slower, left_Nm = size.rate_Hz / 1000.0, size.torque_Nm - size.gravity_Nm - size.friction_Nm
+    changes = {
+        "joint__reduction_ratio": size.ratio, "joint__inertia_kgm2": size.inertia_kgm2,
+        "joint__gravity_Nm": size.gravity_Nm, "virtual__gravity_Nm": size.gravity_Nm,
+        "drive__rated_torque_Nm": 1.01 * size.torque_Nm / size.ratio,
+        "drive__rated_current_A": 10.1 * size.torque_Nm / size.ratio, "drive__rated_tolerance": 0.2,
+        "encoder__counts_per_turn": 2**size.bits, "limits__torque_max_Nm": size.torque_Nm,
+        "limits__torque_rate_max_Nmps": 333.0 * size.torque_Nm, "limits__velocity_max_radps": size.speed_radps,
+        "limits__position_min_rad": -size.travel_rad, "limits__position_max_rad": size.travel_rad,
+        "limits__following_error_max_rad": min(0.1, 0.2 * size.travel_rad),
+        "limits__position_jump_max_rad": 0.02 + 6.0 * size.speed_radps / size.rate_Hz,
+        "limits__standstill_radps": 0.02 * size.speed_radps, "trajectory__amplitude_rad": 0.3 * size.travel_rad,
+        "trajectory__frequency_Hz": min(0.1, 0.1 * size.speed_radps / size.travel_rad),
+        "sequence__brake_radps2": min(10.0 * size.speed_radps, 0.3 * left_Nm / size.inertia_kgm2),
+        "loop__rate_Hz": size.rate_Hz, "control__kp": 3600.0 * slower**2, "control__kv": 120.0 * slower,
+        "control__observer_radps": 60.0 * slower, "control__velocity_cutoff_Hz": 200.0 * slower,
+        "control__learning": None, "friction__torque_side": "joint", "virtual__torque_ripple_Nm": (),
+        "virtual__torque_ripple_per_motor_turn": (), "virtual__friction_positive_scale": 1.0,
+        "virtual__friction_negative_scale": 1.0, "virtual__current_limit_A": 100.0 * size.torque_Nm / size.ratio,
+        "virtual__bristle_stiffness_Nmprad": max(size.friction_Nm / 2e-4, 1.0),
+        "virtual__bristle_damping_Nmspr": 0.5 * (size.friction_Nm / 2e-4 * size.inertia_kgm2) ** 0.5,
+        **curve, **more,
+    }  # fmt: skip
+    return config.changed(**changes)
+
+
+each_size = pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+
+
+@each_size
+def test_the_check_of_the_direction_finds_direction_and_friction(size: Size) -> None:
+    """A heavy joint is still hardly in motion when the spring pulls with twice its friction."""
+    config = joint(size)
+    found, records, fault = checked(config)
+    assert fault is Fault.NONE
+    assert not [finding.text for finding in found.values() if finding.status == PROBLEM]
+    assert 0.5 < found["friction"].numbers["break_away_Nm"] / size.friction_Nm < 2.0
+    assert np.max(np.abs(records.velocity_radps)) < size.speed_radps
+    assert np.max(np.abs(records.command_torque_Nm)) <= make_plan(config, None).torque_Nm * (1.0 + 1e-9)
+
+
+@each_size
+def test_the_reference_of_that_check_is_within_half_of_its_velocity_limit(size: Size) -> None:
+    config = joint(size)
+    plan = make_plan(config, None)
+    assert plan.velocity_radps <= size.speed_radps
+    assert PEAK * plan.travel_rad / plan.ramp_s <= 0.5 * plan.velocity_radps * (1.0 + 1e-9)
+    assert config_of_check(config, plan).limits.torque_max_Nm == plan.torque_Nm <= size.torque_Nm
+    assert plan.travel_rad >= TRAVEL_rad
+
+
+@each_size
+def test_the_motions_that_measure_friction_fit(size: Size) -> None:
+    config = joint(size)
+    plan = sweep_plan(config, SweepOptions(quick=True, lockstep=True))
+    motion = plan.motion(plan.points, 0.0)
+    assert len(plan.points) >= 24
+    assert motion.high_rad - motion.low_rad <= plan.settings.width_rad + 1e-9
+    assert max(abs(point.velocity_radps) for point in plan.points) <= 0.9 * size.speed_radps
+    design = designed(config, 20.0, 1)
+    assert np.max(np.abs(design.torque_Nm)) <= 0.8 * size.torque_Nm
+
+
+def test_a_motion_under_much_gravity_takes_half_of_what_it_and_friction_leave() -> None:
+    """Gravity and friction alone are more than 0.8 of the torque: no brake_radps2 made it fit."""
+    size = SIZES["loaded base"]
+    design = designed(joint(size, joint__gravity_zero_rad=-1.57), 20.0, 1)
+    assert np.max(np.abs(design.torque_Nm)) <= 0.5 * (size.torque_Nm + size.friction_Nm + size.gravity_Nm)
+    overloaded = joint(size, joint__gravity_zero_rad=-1.57, joint__gravity_Nm=290.0)
+    with pytest.raises(UsageError) as error:
+        designed(overloaded, 20.0, 1)
+    assert "a greater limits.torque_max_Nm" in error.value.hint
+
+
+@each_size
+def test_the_response_slides_and_is_excited_within_speed_and_torque(size: Size) -> None:
+    config = config_of_response(joint(size), None)
+    speed, _ = speed_and_period(config)
+    assert 0.01 <= speed <= VELOCITY_SHARE * size.speed_radps
+    peak_Nm = largest_peak_Nm(config)
+    assert 0.0 < peak_Nm <= 0.15 * size.torque_Nm
+    assert peak_Nm / size.inertia_kgm2 <= LARGEST_radps2 * min(speed / USUAL_SPEED_radps, 1.0) * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "speed_radps"), [("finger", 0.03), ("wrist", 0.03), ("base", 0.03), ("slow base", 0.025)]
+)
+def test_a_map_is_as_slow_as_the_joint(name: str, speed_radps: float) -> None:
+    motion = config_of_map(joint(SIZES[name]), MapOptions()).trajectory
+    assert motion.kind == "trapezoid"
+    assert motion.speed_radps == speed_radps
+
+
+@pytest.mark.parametrize("name", ["short finger", "short elbow", "direct drive"])
+def test_a_joint_that_cannot_turn_its_motor_four_times_has_no_map(name: str) -> None:
+    with pytest.raises(UsageError, match=r"position_min_rad and position_max_rad leave .* takes .* 4 motor turns"):
+        config_of_map(joint(SIZES[name]), MapOptions())
+
+
+@pytest.mark.parametrize(("name", "stiff"), [("base", True), ("loaded base", True), ("short elbow", False)])
+def test_the_spring_that_measures_bristles_is_quick_enough_for_a_heavy_joint(name: str, stiff: bool) -> None:
+    motion = presliding_motion(joint(SIZES[name]))
+    assert motion is not None
+    assert motion.config.control.kp >= 36.0 * (1.0 - 1e-9)
+    assert (motion.stretch_rad < 0.04) is stiff
+
+
+def test_an_encoder_that_is_coarse_for_that_spring_measures_no_bristles() -> None:
+    assert presliding_motion(joint(SIZES["loaded base"]._replace(bits=12))) is None
+
+
+def test_the_gains_leave_the_torque_that_friction_and_gravity_need() -> None:
+    """Otherwise the next motion of a tune is refused, since one count of the encoder reaches the limit."""
+    config = joint(SIZES["wrist"], margin__loop_delay_s=1e-3)
+    chosen = choose_gains(config, BELIEVED)
+    assert chosen.missed == {}
+    tuned = config.changed(control=chosen.control)
+    refuse_chatter(tuned, loop_settings(tuned)[0])
+    left_Nm = 5.0 - 4.0 - (static_friction_Nm(config) or 0.0)
+    assert chosen.best.step_Nm < left_Nm
+
+
+@pytest.mark.parametrize("rate_Hz", [250.0, 500.0, 1000.0, 2000.0])
+def test_learning_leads_by_as_long_at_any_rate(rate_Hz: float) -> None:
+    config = joint(SIZES["loaded base"]._replace(rate_Hz=rate_Hz), margin__loop_delay_s=1.0 / rate_Hz)
+    learning = choose_gains(config, BELIEVED, "precise").control.learning
+    assert learning is None or learning.lead_cycles / rate_Hz == pytest.approx(0.01, abs=0.5 / rate_Hz)
+
+
+@pytest.mark.parametrize(
+    ("friction_Nm", "noise_Nm"), [(0.05, 0.2), (1.2726, 5.0), (7.6, 5.0), (19.0575, 5.0), (100.0, 20.0)]
+)
+def test_the_adaptation_believes_no_more_noise_than_the_friction_can_make(friction_Nm: float, noise_Nm: float) -> None:
+    config = joint(SIZES["base"]._replace(friction_Nm=friction_Nm), control__adaptation=Adaptation())
+    record = axis_constants(config, np.zeros((1, 5)))[0].law.adaptation
+    assert record.noise_Nm == pytest.approx(noise_Nm)
+
+
+@pytest.mark.parametrize(("given_Nm", "expected_Nm"), [("auto", 0.0035), (0.01, 0.01)])
+def test_the_ripple_that_is_expected_is_a_share_of_the_torque(given_Nm: Any, expected_Nm: float) -> None:
+    adaptation = Adaptation(ripple_per_motor_turn=(2.0,), ripple_Nm=given_Nm)
+    record = axis_constants(joint(SIZES["finger"], control__adaptation=adaptation), np.zeros((1, 5)))[0].law.adaptation
+    assert record.ripple_Nm == pytest.approx(expected_Nm)
+    assert record.ripple_max_Nm == pytest.approx(4.0 * expected_Nm)
+
+
+@pytest.mark.parametrize(("name", "factor"), [("base", 1.0), ("short elbow", 1.0), ("short finger", 50.0 / 15.0)])
+def test_a_virtual_drive_holds_its_speed_against_the_friction_of_its_joint(name: str, factor: float) -> None:
+    size = SIZES[name]
+    expected = 200.0 * size.inertia_kgm2 / 2.1 * factor
+    assert device_settings(joint(size)).velocity_gain_Nmspr == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("bits", "share"), [(19, 0.9), (12, 0.68)])
+def test_a_coarse_encoder_reads_no_plateau_beyond_the_limit(bits: int, share: float) -> None:
+    config = shipped("precise", encoder__counts_per_turn=2**bits, loop__rate_Hz=250.0, control__velocity_cutoff_Hz=70.0)
+    with pytest.raises(
+        UsageError, match=rf"--max-speed \(=0.95\) must be at most .* {share:.0%} of limits.velocity_max"
+    ):
+        sweep_plan(config, SweepOptions(max_speed_radps=0.95))
