@@ -132,6 +132,12 @@ def _limited_A(m: ElmoMotor, demand_A: float, step_s: float) -> float:
 
 
 @kernel
+def joint_sign(c: PlantConstants, m: ElmoMotor) -> float:
+    """-1: positive current drives the joint to negative angles."""
+    return float(m.current_sign) if c.counts_prad > 0.0 else -float(m.current_sign)
+
+
+@kernel
 def advance_motor(m: ElmoMotor, c: PlantConstants, s: PlantState, substeps: int) -> None:
     """Drive and joint together, `substeps` of `c.step_s`."""
     for _ in range(substeps):
@@ -153,7 +159,7 @@ def advance_motor(m: ElmoMotor, c: PlantConstants, s: PlantState, substeps: int)
                 target_cps = _profile_cps(m, counts)
                 demand_A = m.current_sign * _speed_demand_A(m, target_cps, speed_cps, c.step_s)
         m.demand_A = _limited_A(m, demand_A, c.step_s)
-        step_plant(c, s, m.demand_A * c.torque_per_current_NmpA)
+        step_plant(c, s, joint_sign(c, m) * m.demand_A * c.torque_per_current_NmpA)
 
 
 @kernel
@@ -226,6 +232,11 @@ class ElmoInterpreter:
         self.target_counts = 0.0
         self._plain: dict[tuple[str, int], float] = {}
         self.restart()
+
+    @property
+    def current_A(self) -> float:
+        """Of the motor, as the drive counts it: the plant's is positive towards positive angle."""
+        return float(joint_sign(self._c, self.m)) * float(self._s.current_A)
 
     # --- life ---
 
@@ -456,7 +467,7 @@ _HANDLERS: dict[str, Callable[[ElmoInterpreter, float | None], str]] = {
     "MF": lambda d, v: d._read_only(v, str(int(d.m.motor_fault))),
     "EC": lambda d, v: d._read_only(v, str(d.error_code)),
     "VX": lambda d, v: d._read_only(v, str(round(d.speed_cps()))),
-    "IQ": lambda d, v: d._read_only(v, f"{float(d._s.current_A):.4f}"),
+    "IQ": lambda d, v: d._read_only(v, f"{d.current_A:.4f}"),
     "MC": lambda d, v: d._read_only(v, f"{d.settings.maximum_current_A:.4f}"),
     "MS": lambda d, v: d._read_only(v, "2" if d.m.motor_on and d.m.moving else "0"),
     "IP": lambda d, v: d._read_only(v, "0"),

@@ -275,6 +275,24 @@ class TestMotion:
         assert int(say(drive, "VX")[:-1]) == pytest.approx(0.1 * acceleration * PER_RAD, rel=0.01)
         assert say(drive, "IQ") == b"1.0000;"
 
+    @pytest.mark.parametrize("torque_direction", [1, -1])
+    @pytest.mark.parametrize("encoder_direction", [1, -1])
+    def test_each_direction_is_that_of_the_configuration(self, torque_direction: int, encoder_direction: int) -> None:
+        """With torque_direction -1 the virtual joint turned the wrong way, and `doctor --motion` said so."""
+        constants, state = plant(encoder_counts_per_turn=COUNTS, encoder_direction=encoder_direction)
+        settings = ElmoDeviceSettings(current_sign=torque_direction * encoder_direction)
+        for words, joint_side in (
+            (("UM=1", "MO=1", "TC=1"), torque_direction),
+            (("MO=0", "UM=2", "MO=1", f"JV={round(0.5 * PER_RAD)}", "BG"), encoder_direction),
+        ):
+            drive = ElmoInterpreter(settings, constants.copy(), state.copy())
+            say(drive, *words)
+            drive.advance_to(0.1)
+            assert joint_side * float(drive.state[0].joint_position_rad) > 0.0
+            assert encoder_direction * joint_side * int(say(drive, "PX")[:-1]) > 0
+            if words[0] == "UM=1":
+                assert say(drive, "IQ") == b"1.0000;"
+
     def test_speed_mode_follows_jog_along_the_ramp(self) -> None:
         drive = interpreter(friction_kind=2)
         say(drive, "UM=2", "AC=100000", "DC=100000", "MO=1", "JV=20000")
