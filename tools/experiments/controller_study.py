@@ -111,6 +111,7 @@ REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
     20: (1.6e4, (2.5e4, 2.9e4), (7.0, 25.0)),
     25: (3.1e4, (5.0e4, 5.7e4), (14.0, 48.0)),
 }
+SIZED_Nm = 60.0  # limits.torque_max_Nm of the joint that the ranges suit
 ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
 DELAY_ERROR_s = 0.2e-3  # by which the loop delay is measured wrong
 CURVE_degC = 25.0  # at which [friction] holds as it stands

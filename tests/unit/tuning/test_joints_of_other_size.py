@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from jointctl.tools.analysis.margin_gate import refuse_chatter
 from jointctl.tools.configuration.config import Adaptation, Config
 from jointctl.tools.configuration.conversions import static_friction_Nm
 from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.experiments.controller_study import EnsembleSettings, StudySettings
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import PEAK, TRAVEL_rad, config_of_check, make_plan
 from jointctl.tools.sweeping.excitation import designed
@@ -30,8 +32,9 @@ from jointctl.tools.tuning.frequency_response import (
 )
 from jointctl.tools.tuning.presliding import presliding_motion
 from jointctl.tools.verbs.map import MapOptions, config_of_map
+from jointctl.tools.verbs.study import size_warnings
 from jointctl.tools.virtual_joint import device_settings
-from tests.configurations import shipped
+from tests.configurations import shipped, written
 from tests.unit.inspection.test_motion_check import checked
 
 TORQUES = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
@@ -232,3 +235,32 @@ def test_a_coarse_encoder_reads_no_plateau_beyond_the_limit(bits: int, share: fl
         UsageError, match=rf"--max-speed \(=0.95\) must be at most .* {share:.0%} of limits.velocity_max"
     ):
         sweep_plan(config, SweepOptions(max_speed_radps=0.95))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (None, []),
+        ("finger", ["finger.toml is of a joint of 0.0002 kg m2, and the plants are joints of 2.1 kg m2: --base"]),
+        ("base", ["base.toml is of a joint of 300 kg m2"]),
+        ("short elbow", []),
+    ],
+)
+def test_a_study_says_whose_joint_its_plants_are(tmp_path: Path, name: str | None, words: list[str]) -> None:
+    """A finger's law on joints of 60 Nm ended every run as a fault, and nothing said why."""
+    controllers = ["precise"]
+    if name is not None:
+        size = SIZES[name]
+        changes = {"joint__inertia_kgm2": size.inertia_kgm2}
+        controllers.append(str(written(tmp_path / f"{name.replace(' ', '_')}.toml", "precise", **changes)))
+    said = size_warnings(shipped("precise"), StudySettings(controllers=tuple(controllers)))
+    assert len(said) == len(words)
+    assert all(word in line for word, line in zip(words, said, strict=True))
+
+
+def test_a_study_of_another_size_names_the_ranges_that_do_not_suit() -> None:
+    finger = joint(SIZES["finger"])
+    (said,) = size_warnings(finger, StudySettings(controllers=("precise",)))
+    assert "plant.torque_ripple_Nm, plant.bristle_stiffness_Nmprad, plant.bristle_damping_Nmspr" in said
+    own = EnsembleSettings(torque_ripple_Nm=(0.0, 2e-3), bristle_stiffness_Nmprad=(1.0, 9.0), bristle_damping_Nmspr=0.0)
+    assert size_warnings(finger, StudySettings(controllers=("precise",), plant=own)) == []
