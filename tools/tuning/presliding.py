@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 
 STRETCHES_rad = (0.06, 0.04, 0.09, 0.13)  # of the spring at the static friction: the first that the gate allows
 # of the stretch: of a coarser encoder four counts, within which a reading stands, are places apart
-COARSEST_COUNT = 0.02
+COARSEST_COUNT = 0.01
 SLOWEST_radps = 6.0  # of that spring with the joint's inertia: it must be quicker than what follows
 DAMPING = 0.7
 CUTOFF_OVER_LOOP = 4.0  # of the velocity: a count of a coarse encoder must not kick the joint
