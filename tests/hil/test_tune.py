@@ -253,9 +253,9 @@ def test_a_law_that_cannot_look_whether_the_joint_is_the_same_is_no_end(
     assert "warning: whether it is the same joint before the gains is not measured: it swings" in err.getvalue()
 
 
-@pytest.mark.parametrize("dead", [False, True])
+@pytest.mark.parametrize("dead", [None, TooWeak, MarginError])
 def test_a_reading_that_stood_with_the_old_gains_is_looked_at_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dead: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dead: type[JointctlError] | None
 ) -> None:
     """A friction of the file that is too large throws a light joint, which then stands; an encoder may be dead too."""
     looked: list[str] = []
@@ -263,7 +263,7 @@ def test_a_reading_that_stood_with_the_old_gains_is_looked_at_again(
     def same_joint(*given: Any) -> None:
         looked.append(given[-1])
         if dead and len(looked) > 1:
-            raise TooWeak("POSITION_FROZEN")
+            raise dead("POSITION_FROZEN")
 
     monkeypatch.setattr(tune_steps, "require_same_joint", same_joint)
     ends = {"verification": {"rmse_mrad": 0.1}, "the same before": {"fault": "POSITION_FROZEN"}}
@@ -273,7 +273,7 @@ def test_a_reading_that_stood_with_the_old_gains_is_looked_at_again(
     job.state |= {"direction": [{"numbers": {}}], "response": {"law": FED_STIFF}}
     job.fit, job.response = Mock(), Mock()
     if dead:
-        with pytest.raises(TooWeak, match="POSITION_FROZEN"):
+        with pytest.raises(dead, match="POSITION_FROZEN"):
             job._step_verification()
     else:
         assert job._step_verification()["before"] == {"fault": "POSITION_FROZEN"}

@@ -49,6 +49,7 @@ from jointctl.tools.analysis.margins import at_rate, cases, converging, margins_
 from jointctl.tools.configuration.checks import OBSERVING
 from jointctl.tools.configuration.config import Adaptation, Config, Control
 from jointctl.tools.configuration.conversions import (
+    free_torque_Nm,
     friction_fall_Nmspr,
     joint_rad_per_count,
     law_resolution_rad,
@@ -496,8 +497,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
     """The search, from the [control] of the configuration."""
     from scipy.optimize import minimize  # here: only a search waits for it
 
-    limit_Nm = config.limits.torque_max_Nm
-    left_Nm = limit_Nm - (static_friction_Nm(config) or 0.0) - abs(config.joint.gravity_Nm)
+    limit_Nm, left_Nm = config.limits.torque_max_Nm, free_torque_Nm(config)
     ends = zip((PHASE_MARGIN_deg, GAIN_MARGIN, law.sensitivity), STICKY, strict=True)
     wanted = (float(np.interp(intervals.friction_radps2, STICKY_radps2, pair)) for pair in ends)
     gate_deg, gate_s = config.margin.min_phase_margin_deg / GRID_SPARE, GRID_SPARE * settings.largest_s

@@ -28,7 +28,7 @@ from jointctl.tools.analysis.margins import (
     worst_case,
 )
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
+from jointctl.tools.configuration.conversions import free_torque_Nm, joint_rad_per_count, law_resolution_rad
 from jointctl.tools.configuration.records import encoders_of_law
 
 if TYPE_CHECKING:
@@ -249,14 +249,17 @@ def coarsest(config: Config, settings: LoopSettings) -> tuple[float, str, str]:
     return float(np.max(steps_Nm[0]) * resolution_rad), law, of_law
 
 
+OVERLOADED = "a greater limits.torque_max_Nm; or [friction] and joint.gravity_Nm are of another joint"
+
+
 def refuse_chatter(config: Config, settings: LoopSettings) -> None:
     """`MarginError` where the torque that moves the joint and one count on top of it reach the limit."""
     (step_Nm, counts, remedy), limit_Nm = coarsest(config, settings), config.limits.torque_max_Nm
-    holding_Nm = (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
+    holding_Nm = limit_Nm - free_torque_Nm(config)
     if holding_Nm >= limit_Nm:
         raise MarginError(
             f"friction and gravity need {holding_Nm:.3g} Nm, limits.torque_max_Nm (={limit_Nm:g}) must be more",
-            "a greater limits.torque_max_Nm; or [friction] and joint.gravity_Nm are of another joint",
+            OVERLOADED,
         )
     if step_Nm + holding_Nm >= limit_Nm:
         raise MarginError(

@@ -84,7 +84,7 @@ class Adaptation(Section):
     reach: Annotated[float, between(0.0, 1.0)] = 0.3
     # torque ripple to find: periods a motor turn, two at most
     ripple_per_motor_turn: Annotated[tuple[float, ...], numbers("numbers", 0, 1, RIPPLES, low=0.0, high=1000.0)] = ()
-    # expected of it, at the joint; four times at most; "auto": 0.7 of 60 Nm that limits.torque_max_Nm allows
+    # expected of it, at the joint; four times at most; "auto": 0.7/60 of limits.torque_max_Nm
     ripple_Nm: Annotated[float | Literal["auto"], auto_or_number(1e-9, 1e4)] = "auto"
 
 

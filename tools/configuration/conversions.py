@@ -123,6 +123,11 @@ def static_frictions_Nm(config: Config, friction: Friction) -> tuple[float, floa
     return abs(friction.positive.ts_Nm) * ratio, abs(friction.negative.ts_Nm) * ratio
 
 
+def free_torque_Nm(config: Config) -> float:
+    """What static friction and gravity leave of limits.torque_max_Nm; negative where they take more than that."""
+    return config.limits.torque_max_Nm - (static_friction_Nm(config) or 0.0) - abs(config.joint.gravity_Nm)
+
+
 def friction_fall_Nmspr(config: Config) -> float:
     """How steeply friction falls where the joint begins to slide, of the steeper direction; 0 where none is known."""
     if config.friction is None:

@@ -304,7 +304,7 @@ def identify_friction(
     try:
         points, exponent = _weighted_points(data, options, first, warnings)
     except _TooFewBeside as error:  # without the outliers
-        if options.model != "auto" or options.search_knee:
+        if options.model != "auto" or options.search_knee or options.knee_radps != Options.knee_radps:
             raise
         notes.append(f"{error.seen}, too few for the {first.name} model without the outliers, which was left out")
         first, warnings = FORMS["stribeck"], list(before.warnings)

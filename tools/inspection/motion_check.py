@@ -241,7 +241,8 @@ MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
 LOOSE = 0.2  # of the way that it came: less may be the bristles of friction that holds it
 HEAVY_radps2 = 3.5  # torque over the inertia, below which a joint moves visibly only long after friction has let it go
-LEAST_OF_HEAVY = 0.25  # of that torque, is friction: the inertia may be believed wrongly
+LEAST_OF_HEAVY = 0.25  # of that torque, is friction: the inertia is not seen well
+BEGUN = 0.05  # of the way at which it has begun to move, where it slides
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
@@ -303,7 +304,7 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
 
 
 def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, inertia_kgm2: float = 0.0) -> Motion | None:
-    """None if the drive was never enabled; without `inertia_kgm2` no joint is taken for a heavy one."""
+    """None if the drive was never enabled; without `inertia_kgm2`, the most it may be, no joint is a heavy one."""
     rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
     if powered.sum() < 2:
@@ -317,7 +318,8 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
     first = int(loose[0]) if len(loose) else -1
     # a count of a coarse encoder is a kick of many Nm, too short to move anything
     break_away_Nm = float(np.abs(_smoothed(pushed[: first + 1 or None])).max())
-    if first > 0 and break_away_Nm < HEAVY_radps2 * inertia_kgm2:
+    inertia_kgm2 = min(inertia_kgm2, _seen_inertia_kgm2(rows, way, pushed, first) if first > 0 else 0.0)
+    if break_away_Nm < HEAVY_radps2 * inertia_kgm2:
         # by then most of the work has gone into its speed
         speed = float(np.mean(rows.velocity_radps[max(first - 4, 0) : first + 1]))
         done_J = float(np.sum(pushed[:first] * np.diff(way[: first + 1]))) - 0.5 * inertia_kgm2 * speed * speed
@@ -339,6 +341,21 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
         other_moved_rad=float(other[np.argmax(np.abs(other))]),
         held_Nm=_held_Nm(way[powered], pushed[powered], threshold_rad, held_cycles),
     )
+
+
+def _seen_inertia_kgm2(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> float:
+    """From how the speed of the first slide goes with impulse and time, under constant friction; 0 where it does not.
+
+    That of the file may be many times too large: a light joint would lose most of its friction to it.
+    """
+    begin = int(np.argmax(np.abs(way) >= BEGUN * abs(way[first])))
+    speeds = np.abs(rows.velocity_radps[begin : 3 * first - 2 * begin + SMOOTHED_CYCLES])
+    slide = slice(begin, max(begin + int(np.argmax(speeds)), first) + 1)
+    time_s = (rows.time_ns[slide] - rows.time_ns[begin]) * 1e-9
+    impulse = np.cumsum(pushed[slide] * np.diff(time_s, prepend=0.0))
+    columns = np.column_stack((impulse, time_s, np.ones(len(time_s))))
+    per_kgm2 = float(np.linalg.lstsq(columns, rows.velocity_radps[slide], rcond=None)[0][0])
+    return 1.0 / per_kgm2 if per_kgm2 > 0.0 else 0.0
 
 
 def _held_Nm(way: np.ndarray, torque: np.ndarray, threshold_rad: float, cycles: int) -> float:

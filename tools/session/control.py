@@ -66,7 +66,7 @@ class StopSignals:
 
     @property
     def stopped_by(self) -> str:
-        """What has interrupted it, as far as that is known."""
+        """Name of the signal that has interrupted it, or that it was interrupted."""
         return self.name or "interruption"
 
     def on_signal(self, number: int, _: FrameType | None) -> None:

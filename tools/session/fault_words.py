@@ -239,7 +239,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
     ),
     Fault.POSITION_FROZEN: FaultWords(
         "the position reading stood still although the joint was driven (reference moved by {value:.4f} rad)",
-        "the encoder or its cable is dead, or the joint is blocked, also by more friction than the loop pushes against",
+        "the encoder or its cable is dead, the joint is blocked, or its friction is more than the torque of the loop",
         "turn the joint by hand with the power off and watch the position; check its cable; run `jointctl check`",
     ),
     Fault.SUSPENDED: FaultWords(

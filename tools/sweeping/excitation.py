@@ -21,8 +21,9 @@ import numpy as np
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.trajectory import eased, spline_table
+from jointctl.tools.analysis.margin_gate import OVERLOADED
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
+from jointctl.tools.configuration.conversions import free_torque_Nm, friction_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
 from jointctl.tools.identification.models import EXPERIMENTS, FORMS, SIGNS, Model, Samples, jacobian
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
@@ -53,10 +54,9 @@ EASE_S = 2.0  # in which the sines come and go
 ROW_S = 0.01
 FASTEST_SHARE = (0.3, 1.0)  # of what the limits allow
 TORQUE_SHARE = 0.8  # of limits.torque_max_Nm that the motion may need
-SPARE_SHARE = 0.5  # of what gravity and friction leave of it, where they take more than that
+SPARE_SHARE, MOST_SHARE = 0.5, 0.95  # of what gravity and friction leave of it, where that is less than 0.4; of it
 ERROR, CORRELATED_s = 0.1, 0.1  # of the Coulomb friction; ripple and noise of a usual joint
 OPEN = 0.5  # half the interval over the value from which on a parameter counts as not found
-OVERLOADED = "a greater limits.torque_max_Nm; or [friction] and joint.gravity_Nm are of another joint"
 _SAMPLE_s = 0.02
 _ASSUMED_LOAD = {"load_coulomb": 0.1, "load_viscous": 0.05}  # of a usual strain-wave gear
 _FRICTION_SHARE, _STRIBECK_radps = 0.05, 0.03  # of limits.torque_max_Nm; where no friction is configured
@@ -126,9 +126,10 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     model, vector = believed(config)
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
     slowest = _slowest_radps(model, vector)
-    left_Nm = limits.torque_max_Nm - (static_friction_Nm(config) or 0.0) - abs(config.joint.gravity_Nm)
-    usual_Nm = TORQUE_SHARE * limits.torque_max_Nm
-    most_Nm = max(usual_Nm, limits.torque_max_Nm - SPARE_SHARE * left_Nm) if left_Nm > 0.0 else usual_Nm
+    left_Nm, usual_Nm = free_torque_Nm(config), TORQUE_SHARE * limits.torque_max_Nm
+    most_Nm = usual_Nm
+    if left_Nm > 0.0:
+        most_Nm = min(limits.torque_max_Nm - SPARE_SHARE * left_Nm, MOST_SHARE * limits.torque_max_Nm)
     best: Design | None = None
     best_strong: Design | None = None  # of those that need more than usual
     for number in range(CANDIDATES):

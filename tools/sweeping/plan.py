@@ -303,7 +303,7 @@ def shifted(motion: SweepMotion, middle_rad: float) -> SweepMotion:
 
 # --- the plan that follows from the options, for a joint ---
 
-SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have, and a count of the encoder less
+SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have, and a count less than that limit
 ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
 TRANSIT_SHARE = 0.5  # of the fastest plateau, for ways without measuring
 SETTLE_S = 0.3
@@ -334,9 +334,19 @@ def position_margin_rad(config: Config) -> float:
 
 
 def fastest_allowed_radps(config: Config) -> float:
-    """That no reading of it is beyond limits.velocity_max_radps: the speed of a coarse encoder jumps by a count."""
-    fastest = config.limits.velocity_max_radps
-    return min(SPEED_SHARE * fastest, max(fastest - velocity_of_a_count_radps(config), 0.5 * fastest))
+    """That no reading of it is beyond limits.velocity_max_radps: the speed of a coarse encoder jumps by a count.
+
+    `UsageError` where a count is more than half of that limit.
+    """
+    fastest, count = config.limits.velocity_max_radps, velocity_of_a_count_radps(config)
+    if count > 0.5 * fastest:
+        raise UsageError(
+            f"one count of the encoder reads as {count:.3g} rad/s behind control.velocity_cutoff_Hz "
+            f"(={config.control.velocity_cutoff_Hz:g}), must be at most {0.5 * fastest:.3g}, half of "
+            "limits.velocity_max_radps",
+            "a lower control.velocity_cutoff_Hz, or an encoder with more counts",
+        )
+    return min(SPEED_SHARE * fastest, fastest - count)
 
 
 def make_plan(config: Config, options: SweepOptions) -> SweepPlan:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 SPEED_radps = 0.2  # of the triangle: at 0.05 friction still hides what is looked for
 USUAL_SPEED_radps = 0.1  # at least, where travel and limits.velocity_max_radps allow it
-LEAST_SPEED_radps = 0.01
+LEAST_SPEED_radps = 0.01  # of slow joints, with an excitation that is smaller in proportion and turns no leg round
 SPEED_SPREAD = 0.2  # by which a pair of legs is faster or slower
 VELOCITY_SHARE = 0.4  # of limits.velocity_max_radps: the excitation adds to the speed
 ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2

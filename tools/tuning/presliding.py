@@ -48,8 +48,7 @@ Array = NDArray[np.float64]
 # --- The motion ---
 
 STRETCHES_rad = (0.06, 0.04, 0.09, 0.13)  # of the spring at the static friction: the first that the gate allows
-# of the stretch: of a coarser encoder four counts, within which a reading stands, are places apart
-COARSEST_COUNT = 0.01
+COARSEST_COUNT = 0.01  # of the stretch: a reading stands within four counts, and the places are to be farther apart
 SLOWEST_radps = 6.0  # of that spring with the joint's inertia: it must be quicker than what follows
 DAMPING = 0.7
 CUTOFF_OVER_LOOP = 4.0  # of the velocity: a count of a coarse encoder must not kick the joint
@@ -150,7 +149,7 @@ def presliding_motion(config: Config) -> PreslidingMotion | None:
     sides = (config.friction.positive, config.friction.negative)
     rests_at = [min(max(abs(one.tc_Nm / one.ts_Nm), LEAST_REST), MOST_REST) for one in sides]
     heavy_rad = static_Nm / config.joint.inertia_kgm2 / SLOWEST_radps**2
-    for stretch_rad in STRETCHES_rad if heavy_rad >= max(STRETCHES_rad) else (min(heavy_rad, STRETCHES_rad[0]),):
+    for stretch_rad in dict.fromkeys(min(stretch_rad, heavy_rad) for stretch_rad in STRETCHES_rad):
         if REACH * stretch_rad > MOST_OF_ROOM * room_rad(config):
             continue
         if law_resolution_rad(config) > COARSEST_COUNT * stretch_rad:

@@ -123,7 +123,7 @@ def _warnings(config: Config) -> list[str]:
         found += beyond_torque(config, "the trajectory's largest acceleration", acceleration)
         require_braking(config, trajectory, table)
     except ConfigurationError as error:
-        found.append(error.message.removeprefix(f"{config.path}: "))
+        found.append(error.message.replace(f"{config.path}: ", "") + (f"; {error.hint}" if error.hint else ""))
     except MotionFault as error:
         found.append(f"{error.message}; {error.hint}")
     return found
@@ -187,13 +187,14 @@ def check_cascade(
 def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False) -> int:
     """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
     from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
+    from jointctl.tools.analysis.loop_report import contradictions
     from jointctl.tools.analysis.margin_gate import require_loop
     from jointctl.tools.session.canopen_drive import require_buses
     from jointctl.tools.session.plan import resolve_arm
 
     require_buses(arm.joints)
     budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
-    warnings = [f"{config.path}: {line}" for config in arm.joints for line in _warnings(config)]
+    warnings = [f"{config.path}: {line}" for config in arm.joints for line in contradictions(config)]
     table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
     for budget in budgets:
         note = (

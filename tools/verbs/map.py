@@ -36,11 +36,11 @@ class MapOptions:
 
     travel_rad: Annotated[
         float | None,
-        typer.Option("--travel", metavar="RAD", help="about the middle of the limits (what they allow, 0.7)"),
+        typer.Option("--travel", metavar="RAD", help="about the middle of the limits (0.7, or what these allow)"),
     ] = None
     speed_radps: Annotated[
         float | None,
-        typer.Option("--speed", metavar="RAD/S", help="slow, but faster than the joint sticks (what they allow, 0.03)"),
+        typer.Option("--speed", metavar="RAD/S", help="slow, but faster than the joint sticks (0.03, or less)"),
     ] = None
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
 

@@ -25,6 +25,7 @@ from jointctl.drivers.errors import (
     MarginError,
     MotionFault,
     TooFewPoints,
+    UsageError,
     one_line,
     text_Nm,
 )
@@ -83,14 +84,7 @@ from jointctl.tools.tuning.frequency_response import (
     speed_and_period,
     with_torque_limit,
 )
-from jointctl.tools.tuning.joint_fit import (
-    JointFit,
-    fit_from_dict,
-    fit_of,
-    friction_of,
-    gravity_of,
-    values_of_fit,
-)
+from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_of, friction_of, gravity_of, values_of_fit
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text, measured_bristles
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS
@@ -322,7 +316,9 @@ class Tune:
 
     def chosen_gains(self, law: str, objective: str) -> ChosenGains:
         assert self.fit is not None
-        return choose_gains(self.config, self.fit.intervals(), law, objective)
+        # a choice before this one may have left out what adapts, for another friction
+        config = self.config.changed(control__adaptation=self.original.control.adaptation)
+        return choose_gains(config, self.fit.intervals(), law, objective)
 
     # --- 3. gravity, of the same motion ---
 
@@ -331,8 +327,9 @@ class Tune:
         return {**kept["gravity"], "found": kept["sure"]}
 
     def _take_gravity(self, kept: dict[str, Any]) -> None:
+        none = "none that is certain" if kept["half_Nm"] else "not looked for: the legs of the response are too short"
         self.carrier.output.note(
-            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else "  none that is certain"
+            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else f"  {none}"
         )
         if kept["found"]:
             self.config = with_values(self.config, self.gravity_values())
@@ -430,14 +427,16 @@ class Tune:
         if self.config.reducer is None or self.config.joint_encoder is None:
             return {}
         unmapped = self.config.changed(reducer__map=None)
-        speeds = speeds_in_turn(self.config)
-        for speed_radps in speeds:
-            moving = config_of_map(unmapped, MapOptions(speed_radps=speed_radps))
+        try:
+            motions = [config_of_map(unmapped, MapOptions(speed_radps=one)) for one in speeds_in_turn(self.config)]
+        except UsageError:  # too short a travel
+            return {}
+        for moving in motions:
             try:
                 carried = self.carrier.run(moving, ConfiguredMotion(moving, trajectory_table(moving)), "map")
                 break
             except LimitCycle as error:
-                if speed_radps == speeds[-1]:
+                if moving is motions[-1]:
                     raise
                 self.carrier.output.note(f"  {error.message}: once more, faster")
         settings, _ = loop_settings(moving)
@@ -446,7 +445,7 @@ class Tune:
         return self.found_map.values(encoder.direction, encoder.zero_counts)
 
     def _take_map(self, kept: dict[str, Any]) -> None:
-        self.carrier.output.note("  measured" if kept else "  none: it is for a soft reducer with two encoders")
+        self.carrier.output.note("  measured" if kept else "  none: for a soft reducer, two encoders and 4 motor turns")
         if kept and self.config.reducer is not None:
             values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in kept.items()}
             self.config = self.config.changed(reducer__map=ReducerMap(**values))
@@ -467,7 +466,7 @@ class Tune:
         try:
             require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
         except (MarginError, TooWeak) as error:  # the law of the response, on the joint that is known now
-            if surely and isinstance(error, TooWeak):
+            if surely:
                 raise
             self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 

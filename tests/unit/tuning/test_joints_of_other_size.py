@@ -264,3 +264,10 @@ def test_a_study_of_another_size_names_the_ranges_that_do_not_suit() -> None:
     assert "plant.torque_ripple_Nm, plant.bristle_stiffness_Nmprad, plant.bristle_damping_Nmspr" in said
     own = EnsembleSettings(torque_ripple_Nm=(0.0, 2e-3), bristle_stiffness_Nmprad=(1.0, 9.0), bristle_damping_Nmspr=0.0)
     assert size_warnings(finger, StudySettings(controllers=("precise",), plant=own)) == []
+
+
+@pytest.mark.parametrize("believed_kgm2", [0.3, 0.6, 1.5, 2.1, 5.0])
+def test_an_inertia_that_the_file_has_too_large_takes_no_friction_off_a_light_joint(believed_kgm2: float) -> None:
+    size = Size(60.0, believed_kgm2, 121.0, 5.0, 1.0, 1.0)
+    found, _, _ = checked(joint(size, virtual__inertia_scale=0.3 / believed_kgm2))
+    assert 0.85 < found["friction"].numbers["break_away_Nm"] / size.friction_Nm < 1.2
