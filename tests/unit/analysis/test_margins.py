@@ -432,17 +432,18 @@ def kalman_sets() -> list[LoopSettings]:
 
 
 FRICTIONLESS = replace(Q2500, lag_s=0.3e-3, weight_Nm=0.0)
-SIMULATED = [FRICTIONLESS, replace(Q2500, cutoff_Hz=30.0, weight_Nm=0.0), *gain_sets(), *kalman_sets()]
+OTHERS = [replace(Q2500, cutoff_Hz=30.0, weight_Nm=0.0), *gain_sets(), *kalman_sets()]
+SIMULATED = [(FRICTIONLESS, False), (FRICTIONLESS, True), *((loop, i % 2 == 0) for i, loop in enumerate(OTHERS))]
 
 
-@pytest.mark.parametrize("case", range(1 if JIT_DISABLED else len(SIMULATED)))
+@pytest.mark.parametrize("case", range(2 if JIT_DISABLED else len(SIMULATED)))
 def test_predicted_and_simulated_delay_limits_agree(case):
-    loop = replace(SIMULATED[case], delay_s=0.0)
+    loop, matched = replace(SIMULATED[case][0], delay_s=0.0), SIMULATED[case][1]
     limit_s = delay_margin_s(loop)
     expected = limit_s / SUBSTEP_s
     margin = max(8, round(0.2 * expected))
     found = simulated_limit_substeps(
-        loop, max(round(expected) - margin, 0), min(round(expected) + margin, DELAY_SLOTS - 1), case % 2 == 1
+        loop, max(round(expected) - margin, 0), min(round(expected) + margin, DELAY_SLOTS - 1), matched
     )
     # the virtual joint takes the torque at the end of a substep for all of it: half a substep less lag
     assert abs(found + 0.5 - expected) <= 1.5, (limit_s, found * SUBSTEP_s)

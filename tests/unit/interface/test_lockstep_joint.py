@@ -242,7 +242,7 @@ def test_a_duration_is_refused_by_the_name_that_the_program_gave_it(joint: Joint
 
 @pytest.mark.parametrize("wait_s", [0.001, 1e300])
 def test_a_fault_is_raised_with_its_cause_however_long_is_waited(wait_s: float) -> None:
-    fault = pytest.raises(jointctl.MotionFault, match=r"(POSITION|VELOCITY)_LIMIT")
+    fault = pytest.raises(jointctl.MotionFault, match="VELOCITY_LIMIT")
     with fault, Joint("virtual", lockstep=True) as joint:
         joint.enable()
         for _ in range(3000):
