@@ -136,10 +136,12 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Experiment, "run", lambda self: made(self.key).run)
-    few = Options(swarm=SwarmSettings(particles=60, iterations=200))
-    monkeypatch.setattr(
-        "jointctl.tools.experiments.paper_experiments.identify_paper_friction", lambda: identify_paper_friction(few)
-    )
+    found = identify_paper_friction(Options(swarm=SwarmSettings(particles=60, iterations=200)))
+    assert found.rmse_Nm == pytest.approx(0.0044, abs=0.0004)  # the noise of the sweep
+    assert found.stribeck_rmse_Nm == pytest.approx(0.0170, rel=0.05)
+    assert found.coulomb_rmse_Nm == pytest.approx(0.062, rel=0.05)
+    assert found.curve_error_Nm < 0.006
+    monkeypatch.setattr("jointctl.tools.experiments.paper_experiments.identify_paper_friction", lambda: found)
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "paper.html"
     assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path, report=page) == 0

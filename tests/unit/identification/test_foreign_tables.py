@@ -213,6 +213,9 @@ def test_units_of_every_column(tmp_path, columns, ours):
     milli = read(tmp_path / "b.csv", {**columns, "tau": columns["tau"] / RATIO * 1e3}, torque_unit="mNm",
                  torque_side="motor")  # fmt: skip
     alike(milli, ours)
+    motor = {**columns, "q": np.degrees(columns["q"]) * RATIO, "tau": columns["tau"] / RATIO / 0.1}
+    alike(read(tmp_path / "d.csv", motor, position_unit="deg", side="motor", torque_column=None, torque_side=None,
+               current_column="tau", torque_constant_NmpA=0.1), ours, 2e-5)  # fmt: skip
     warm = {**columns, "warmth": columns["warmth"] * 1.8 + 32.0}
     far = read(tmp_path / "c.csv", warm, temperature_column="warmth", temperature_unit="degF")
     assert far.temperature_degC[50] == pytest.approx(columns["warmth"][50], abs=1e-3)

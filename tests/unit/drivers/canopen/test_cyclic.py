@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jointctl.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
@@ -36,7 +36,11 @@ from jointctl.drivers.canopen.cyclic import (
     answer_owed,
     begin_cycle,
     end_cycle,
+    get_i16,
+    get_i32,
+    get_u16,
     note_wake,
+    put_u16,
     torque_permille,
 )
 from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
@@ -403,6 +407,16 @@ def test_bus_load_counts_both_directions_at_worst_stuffing(wire: Wire) -> None:
     wire.port.cycle = 0
     begin_cycle(wire.port, wire.frames)  # SYNC 55 and heartbeat 65
     assert wire.port.bits_sent == 285 + 55 + 65
+
+
+@given(data=st.binary(min_size=8, max_size=8), value=st.integers(-32768, 65535))
+@example(data=bytes.fromhex("0000800000000080"), value=-32768)  # the lowest integers
+def test_integers_are_little_endian(data: bytes, value: int) -> None:
+    array = np.frombuffer(data, np.uint8).copy()
+    found = get_i16(array, 1), get_u16(array, 2), get_i32(array, 4)
+    assert found == tuple(struct.unpack_from(form, data, at)[0] for form, at in (("<h", 1), ("<H", 2), ("<i", 4)))
+    put_u16(array, 1, value)
+    assert array.tobytes() == data[:1] + struct.pack("<H", value % 65536) + data[3:]
 
 
 # --- A TPDO that repeats or delays an old value is not taken for a new sample ---
