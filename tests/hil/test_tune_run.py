@@ -116,7 +116,7 @@ def begun(joint: Any, simulated: Tune, *steps: str) -> Path:
 def test_a_stop_in_a_step_releases_the_joint_and_the_next_tune_begins_with_that_step(
     joint: Any, simulated: Tune, steps: int, number: signal.Signals
 ) -> None:
-    """Each says where it is meanwhile: the four minutes of the friction were without a line."""
+    """Each step prints its progress: the friction took four minutes without a line."""
     path = begun(joint, simulated, *STEPS[:steps])
     text = path.read_text()
     for _ in range(2):

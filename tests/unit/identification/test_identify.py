@@ -280,7 +280,7 @@ def test_other_peoples_table_gives_the_same_model_as_our_own(sweep, tmp_path):
                                           zip(speed_rpm, rows["current_A"], strict=True)))  # fmt: skip
     told = ForeignFormat(velocity_column="rpm", current_column="A", velocity_unit="r/min", side="motor", ratio=121.0,
                          torque_constant_NmpA=0.1)  # fmt: skip
-    identify(theirs, output(), out=tmp_path / "theirs.toml", given=told or OURS, options=QUICK)
+    identify(theirs, output(), out=tmp_path / "theirs.toml", given=told, options=QUICK)
     ours, other = (tomlkit.parse((tmp_path / f"{n}.toml").read_text()).unwrap()["friction"] for n in ("ours", "theirs"))
     assert other["positive"] == pytest.approx(ours["positive"], rel=1e-3, abs=1e-10)
 
@@ -303,9 +303,9 @@ def foreign_file(folder):
     return path
 
 
-def said(path, told=None, config=None):
+def said(path, given=OURS, config=None):
     out = output()
-    assert identify(path, out, config=config, given=told or OURS, options=QUICK) == 0
+    assert identify(path, out, config=config, given=given, options=QUICK) == 0
     return out.stderr.getvalue().replace("\n", " ")
 
 

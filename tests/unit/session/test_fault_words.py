@@ -262,7 +262,7 @@ def told(fault: Fault, value: float, records: Any) -> bool:
         (Fault.POSITION_DISAGREEMENT, 0.1, "skipped", FAULTY, 90, False),  # no pause causes it
     ],
 )  # fmt: skip
-def test_a_pause_that_may_have_caused_it_is_told(
+def test_a_pause_that_may_have_caused_it_is_reported(
     fault: Fault, value: float, field: str, index: int, paused: int, expected: bool
 ) -> None:
     assert told(fault, value, paused_records(fault, **{field: (index, paused)})) is expected
