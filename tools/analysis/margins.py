@@ -410,12 +410,12 @@ class Convergence:
 
 @dataclass(frozen=True)
 class RepeatedLoop:
-    """One joint's loop as learning meets it: P and L at frequencies (N,) of which the last is 1 Hz."""
+    """One joint's loop as learning meets it: G and T at frequencies (N,) of which the last is 1 Hz."""
 
     settings: LoopSettings
     omega_radps: Array
-    plant: ComplexArray
-    open_loop: ComplexArray
+    moved: ComplexArray
+    taken: ComplexArray
 
     def convergence(self, learning: Learning) -> Convergence:
         factor, remaining = self.factor(learning)
@@ -425,14 +425,12 @@ class RepeatedLoop:
     def factor(self, learning: Learning) -> tuple[Array, Array]:
         """(|M|, |1 - S| / |1 - M|) at its frequencies, arrays (N,)."""
         angles = self.omega_radps * self.settings.period_s
-        moved = self.plant / (1.0 + self.open_loop)
-        taken = self.open_loop / (1.0 + self.open_loop)
         width = learning.half_width_cycles
         smoothing = np.ones_like(angles)
         for k in range(1, width + 1):
             smoothing = smoothing + 2.0 * np.cos(k * angles)
         smoothing = smoothing / (2 * width + 1)
-        seen = taken + self.settings.inertia_kgm2 * learning.error_gain_ps2 * moved
+        seen = self.taken + self.settings.inertia_kgm2 * learning.error_gain_ps2 * self.moved
         factor = smoothing * (1.0 - learning.gain * np.exp(1j * angles * learning.lead_cycles) * seen)
         return np.abs(factor), np.abs(1.0 - smoothing) / np.abs(1.0 - factor)
 
@@ -442,8 +440,12 @@ def repeated_loops(settings: LoopSettings) -> list[RepeatedLoop]:
     omega = np.append(frequencies_radps(settings.period_s), math.tau)
     z = np.exp(1j * omega * settings.period_s)
     law = linear_loop(settings).controller.response(z)
-    plants = [(case, linear_loop(case).joint.response(z)) for case in cases(settings)]
-    return [RepeatedLoop(case, omega, plant[:, 0, 0], -(law @ plant)[:, 0, 0]) for case, plant in plants]
+    found = []
+    for case in cases(settings):
+        plant = linear_loop(case).joint.response(z)
+        open_loop = -(law @ plant)[:, 0, 0]
+        found.append(RepeatedLoop(case, omega, plant[:, 0, 0] / (1.0 + open_loop), open_loop / (1.0 + open_loop)))
+    return found
 
 
 def slowest_convergence(loops: list[RepeatedLoop], learning: Learning) -> Convergence:

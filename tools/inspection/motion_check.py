@@ -316,14 +316,6 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
     work = float(np.sum(pushed[:-1] * np.diff(way)))
     loose = np.nonzero(np.abs(way) >= max(threshold_rad, LOOSE * np.abs(way).max()))[0]
     first = int(loose[0]) if len(loose) else -1
-    # a count of a coarse encoder is a kick of many Nm, too short to move anything
-    break_away_Nm = float(np.abs(_smoothed(pushed[: first + 1 or None])).max())
-    inertia_kgm2 = min(inertia_kgm2, _seen_inertia_kgm2(rows, way, pushed, first) if first > 0 else 0.0)
-    if break_away_Nm < HEAVY_radps2 * inertia_kgm2:
-        # by then most of the work has gone into its speed
-        speed = float(np.mean(rows.velocity_radps[max(first - 4, 0) : first + 1]))
-        done_J = float(np.sum(pushed[:first] * np.diff(way[: first + 1]))) - 0.5 * inertia_kgm2 * speed * speed
-        break_away_Nm = min(max(done_J / abs(way[first]), LEAST_OF_HEAVY * break_away_Nm), break_away_Nm)
     smooth, measured = _smoothed(torque), _smoothed(np.asarray(rows.measured_torque_Nm))
     strong = np.abs(smooth) > 0.5 * np.abs(smooth).max()
     ratio = None
@@ -334,13 +326,28 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        break_away_Nm=break_away_Nm,
+        break_away_Nm=_break_away_Nm(rows, way, pushed, first, inertia_kgm2),
         torque_max_Nm=float(np.abs(smooth).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
         other_moved_rad=float(other[np.argmax(np.abs(other))]),
         held_Nm=_held_Nm(way[powered], pushed[powered], threshold_rad, held_cycles),
     )
+
+
+def _break_away_Nm(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int, inertia_kgm2: float) -> float:
+    """Of the torques (N,) up to the row `first` of the way (N,) that counts as motion; -1: of all, it did not move."""
+    # a count of a coarse encoder is a kick of many Nm, too short to move anything
+    most_Nm = float(np.abs(_smoothed(pushed[: first + 1 or None])).max())
+    if first <= 0:
+        return most_Nm
+    inertia_kgm2 = min(inertia_kgm2, _seen_inertia_kgm2(rows, way, pushed, first))
+    if most_Nm >= HEAVY_radps2 * inertia_kgm2:
+        return most_Nm
+    # by then most of the work has gone into its speed
+    speed = float(np.mean(rows.velocity_radps[max(first - 4, 0) : first + 1]))
+    done_J = float(np.sum(pushed[:first] * np.diff(way[: first + 1]))) - 0.5 * inertia_kgm2 * speed * speed
+    return min(max(done_J / abs(way[first]), LEAST_OF_HEAVY * most_Nm), most_Nm)
 
 
 def _seen_inertia_kgm2(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> float:

@@ -129,20 +129,19 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     left_Nm, usual_Nm = free_torque_Nm(config), TORQUE_SHARE * limits.torque_max_Nm
     most_Nm = usual_Nm
     if left_Nm > 0.0:
-        most_Nm = min(limits.torque_max_Nm - SPARE_SHARE * left_Nm, MOST_SHARE * limits.torque_max_Nm)
+        spared_Nm = limits.torque_max_Nm - SPARE_SHARE * left_Nm
+        most_Nm = max(usual_Nm, min(spared_Nm, MOST_SHARE * limits.torque_max_Nm))
     best: Design | None = None
-    best_strong: Design | None = None  # of those that need more than usual
+    best_rank = (True, math.inf)  # one that needs no more than usual comes first
     for number in range(CANDIDATES):
         random = np.random.default_rng([seed, number])
         slower = replace(settings, transit_radps=fastest * float(random.uniform(*FASTEST_SHARE)))
         motion = _candidate(slower, slowest, duration_s, random)
         found = _judged(motion, middle, slowest, model, vector)
         needed_Nm = float(np.max(np.abs(found.torque_Nm)))
-        if needed_Nm <= usual_Nm and (best is None or found.condition < best.condition):
-            best = found
-        elif usual_Nm < needed_Nm <= most_Nm and (best_strong is None or found.condition < best_strong.condition):
-            best_strong = found
-    best = best or best_strong
+        rank = (needed_Nm > usual_Nm, found.condition)
+        if needed_Nm <= most_Nm and (best is None or rank < best_rank):
+            best, best_rank = found, rank
     if best is None:
         raise UsageError(
             f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must leave room for gravity, friction and the "

@@ -368,10 +368,10 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
         assert options.speeds is not None
         velocities = listed_velocities(options.speeds)
         fastest = max(abs(v) for v in velocities)
-        _check_fastest(config, f"fastest speed of {options.speeds}", fastest, reachable)
+        _check_fastest(config, f"fastest speed of {options.speeds}", fastest, reachable, allowed)
     else:
         fastest = options.max_speed_radps or reachable
-        _check_fastest(config, "--max-speed", fastest, reachable)
+        _check_fastest(config, "--max-speed", fastest, reachable, allowed)
         slowest = options.min_speed_radps or fastest / (QUICK_RATIO if options.quick else SPEED_RATIO)
         if not slowest < fastest:
             raise UsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
@@ -408,9 +408,8 @@ def _width_rad(config: Config, options: SweepOptions) -> float:
     return min((2.0 * min(place - low, high - place) for place in options.places_rad or ()), default=high - low)
 
 
-def _check_fastest(config: Config, name: str, fastest: float, reachable: float) -> None:
+def _check_fastest(config: Config, name: str, fastest: float, reachable: float, allowed: float) -> None:
     if fastest > reachable * (1.0 + 1e-9):
-        allowed = fastest_allowed_radps(config)
         share = f"{allowed / config.limits.velocity_max_radps:.0%} of limits.velocity_max_radps"
         why = share if reachable == allowed else "what the travel allows"
         raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")

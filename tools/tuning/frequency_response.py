@@ -140,7 +140,7 @@ def speed_and_period(config: Config) -> tuple[float, float]:
     fastest = min(SPEED_radps, VELOCITY_SHARE * config.limits.velocity_max_radps)
     wanted = ((PERIOD_s, 0.7 * SPEED_radps), (SHORT_PERIOD_s, USUAL_SPEED_radps), (SHORT_PERIOD_s, LEAST_SPEED_radps))
     for length_s, least in wanted:
-        speed = fastest
+        speed = fastest  # where it is less than wanted, this one alone is tried before the last
         while speed >= min(least, max(fastest, LEAST_SPEED_radps)):
             if _length_rad((1.0 + SPEED_SPREAD) * speed, length_s, acceleration) <= width:
                 return speed, length_s
@@ -298,16 +298,19 @@ class ResponseMotion:
         plan, config = self.plan, self.config
         top = float(np.max(np.abs(plan.legs.velocity_radps)))
         duration_s = len(plan.legs.velocity_radps) / config.loop.rate_Hz
-        frequency, control, more = plan.sine.frequency_Hz, config.control, plan.peak_Nm < self.most_Nm
-        then = f"; the same again with more while the coherence is low, up to {text_Nm(self.most_Nm, 2)}"
+        frequency, control = plan.sine.frequency_Hz, config.control
+        excited = f"{text_Nm(plan.peak_Nm, 2)} on top of what the motion takes"
+        if plan.peak_Nm < self.most_Nm:
+            excited = (
+                f"at first {excited}; the same again with more while the coherence is low, up to "
+                f"{text_Nm(self.most_Nm, 2)}, about 2 minutes in all"
+            )
         return [
             *joint_lines(report, config.limits),
             f"approach   to {start_rad:+.4f} rad in {approach_s:.1f} s",
             f"motion     {start_rad:+.3f} .. {start_rad + plan.legs.width_rad:+.3f} rad, back and forth at up to "
             f"{text_radps(top)}, {duration_s:.0f} s",
-            f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, "
-            f"{'at first ' if more else ''}{text_Nm(plan.peak_Nm, 2)} on top of what the motion takes"
-            f"{f'{then}, about 2 minutes in all' if more else ''}",
+            f"excitation multisine of {len(frequency)} lines, {frequency[0]:g} .. {frequency[-1]:g} Hz, {excited}",
             f"law        kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s; "
             "a stiffer one follows where the weak one is too weak for the friction",
             limits_line(config.limits),
