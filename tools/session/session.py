@@ -39,7 +39,7 @@ from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, Vi
 from jointctl.tools.session.fault_words import held_up_text, read_off_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.loops import loop_of
-from jointctl.tools.session.plan import Consent, Placed, RunPlan, prepare_log, require_ready
+from jointctl.tools.session.plan import Consent, JointPlan, Placed, RunPlan, prepare_log, require_ready
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import (
     Around,
@@ -232,6 +232,16 @@ class Session:
             prepare_log(joint.config, joint.log_path, self._output)
         return True
 
+    def _metadata(self, joint: JointPlan, report: CommissioningReport) -> dict[str, dict[str, str]]:
+        """Of the log of a joint."""
+        plan, metadata = self.plan, run_metadata(joint.config, report)
+        if plan.arm is not None:  # its [motion] is what the joint does, not the joint's own [trajectory]
+            arm = plan.arm.config
+            metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
+        if plan.log_every > 1:
+            metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+        return metadata
+
     def _supervise(
         self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
         around: Mapping[int, Around],
@@ -247,12 +257,7 @@ class Session:
                 watches: list[RunWatch] = []
                 orders: list[ViewerRequest] = []
                 for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
-                    metadata = run_metadata(joint.config, report)
-                    if plan.arm is not None:  # its [motion] is what the joint does, not the joint's own [trajectory]
-                        arm = plan.arm.config
-                        metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
-                    if plan.log_every > 1:
-                        metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+                    metadata = self._metadata(joint, report)
                     names = (plan.names if axis == 0 else (joint.name,)) if joint.name else JOINT_NAMES
                     log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
                     kept = stack.enter_context(KeptRecords(joint.log_path.parent))
@@ -276,8 +281,32 @@ class Session:
         self, drives: DriveGroup, loop: LoopHandle, constants: np.recarray, reports: Sequence[CommissioningReport],
         watches: Sequence[RunWatch],
     ) -> RunResult:  # fmt: skip
-        watch = watches[0]
-        signals = watch.around.signals
+        """Start, motion and end of the loop; then the drives are switched off, and the logs say how it went."""
+        started_ns = self._start(drives, loop, constants, watches)
+        self._poll_until_ended(drives, loop, watches)
+        elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
+        for each in watches:
+            each.take_records(last=True)
+            each.tell_stop(each.around.signals.request)
+        for each in watches:
+            with blamed(each.joint.name):
+                self._raise_what_others_did(each, loop)
+        states = self._made_safe(drives)
+        self._log_after_run(loop, watches, self._common(states))
+        loads = [
+            self._kind.bits_sent(loop.block.port, axis) / (joint.config.bus.bitrate_bitps * elapsed_s)
+            for axis, joint in enumerate(self._joints)
+        ]
+        results = [
+            self._result(each, report, self._common(states), load, own)
+            for each, report, load, own in zip(watches, reports, loads, states, strict=True)
+        ]
+        return replace(results[0], others=tuple(results[1:]))
+
+    @staticmethod
+    def _start(drives: DriveGroup, loop: LoopHandle, constants: np.recarray, watches: Sequence[RunWatch]) -> int:
+        """The loop begins, and from here on a stop reaches it; when that was, in ns of the monotonic clock."""
+        signals = watches[0].around.signals
         loop.listen()
         signals.on_command = loop.request_stop
         if signals.commanded_ns:  # just before: the loop gets it all the same, and never enables
@@ -289,6 +318,11 @@ class Session:
         signals.begin()
         started_ns = time.monotonic_ns()
         loop.go(constants, drives.port())
+        return started_ns
+
+    def _poll_until_ended(self, drives: DriveGroup, loop: LoopHandle, watches: Sequence[RunWatch]) -> None:
+        """Look after the loop while it runs; where that fails, the joint is braked before the error goes on."""
+        watch = watches[0]
         try:
             while loop.running():
                 for each in watches:
@@ -301,7 +335,8 @@ class Session:
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, watch, StopRequest.QUICK_STOP)
-            if not stop_has_come(signals, self.plan.configs) and not self._explained_by_restart(error, loop):
+            stopped = stop_has_come(watch.around.signals, self.plan.configs)
+            if not stopped and not self._explained_by_restart(error, loop):
                 self._log_end(watches, error)
                 raise MotionFault(error.message, error.hint) from None
         except BaseException as error:
@@ -309,15 +344,11 @@ class Session:
             if isinstance(error, DataError):  # a disk that is full, say
                 error.message += "; the motion was ended for it"
             raise
-        elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
-        for each in watches:
-            each.take_records(last=True)
-            each.tell_stop(signals.request)
-        for each in watches:
-            with blamed(each.joint.name):
-                self._raise_what_others_did(each, loop)
-        states = self._made_safe(drives)
-        state = self._common(states)
+
+    @staticmethod
+    def _log_after_run(loop: LoopHandle, watches: Sequence[RunWatch], state: str) -> None:
+        """The last records and frames, and what a run tells of its buses when it is over."""
+        watch = watches[0]
         for each in watches:
             if each.around.recorder is not None:
                 each.around.recorder.end()
@@ -335,15 +366,6 @@ class Session:
                 f"SYNC of all buses within {spread.p99_us:.0f} us in 99 % of the cycles, "
                 f"{spread.max_us:.0f} us at most",
             )  # fmt: skip
-        loads = [
-            self._kind.bits_sent(loop.block.port, axis) / (joint.config.bus.bitrate_bitps * elapsed_s)
-            for axis, joint in enumerate(self._joints)
-        ]
-        results = [
-            self._result(each, report, state, load, own)
-            for each, report, load, own in zip(watches, reports, loads, states, strict=True)
-        ]
-        return replace(results[0], others=tuple(results[1:]))
 
     @staticmethod
     def _log_end(watches: Sequence[RunWatch], error: JointctlError) -> None:
