@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -183,24 +184,12 @@ def identify(
     """Fit the friction model (11) to plateaus, or to any motion; writes TOML, figures and a report beside the data."""
     # into: the section goes into it, figures and the JSON report beside the data.  Otherwise into `out`, default
     # DATA.friction.toml, and they beside it.
-    from jointctl.tools.configuration.found_values import friction_snippet, with_friction_section, write_changed
-    from jointctl.tools.configuration.load import shipped_config
-    from jointctl.tools.drawing import png
+    from jointctl.tools.configuration.found_values import friction_snippet
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
-    from jointctl.tools.recording.report_page import check_target
-    from jointctl.tools.written_file import refuse_unwritable, replace_file, require_target
 
     options = options or Options()
-    if out is not None and out.suffix != ".toml":
-        raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
-    if report is not None:
-        check_target(report, [path for path in (data_path, into, config) if path is not None])
-    if into is not None and not into.exists() and shipped_config(into.name).exists():
-        hint = f"`jointctl new FILE --from {into.stem}` makes one of your own"
-        raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
-    if into is not None:
-        refuse_unwritable(into)
+    _require_targets(into, out, report, [path for path in (data_path, into, config) if path is not None])
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
     in_time = is_series(data_path, given)
@@ -211,26 +200,14 @@ def identify(
         output.address(f"{data_path}: {note}")
     for warning in found.warnings:
         output.warning(warning)
-
     if out is None and into is None:
         out = data_path.with_suffix(".friction.toml")
-    stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
-    result = {**found.result, "friction": found.section}
     text = friction_snippet(found.section, found.remarks)
-    files = {stem.with_name(f"{stem.name}{end}.png"): png(figure) for end, (figure, _) in found.pictures.items()}
-    report_json = json.dumps(result, indent=1, allow_nan=False)
-    files[stem.with_name(stem.name + ".report.json")] = report_json.encode("utf-8")
-    if out is not None:
-        files[out] = text.encode("utf-8")
+    result = {**found.result, "friction": found.section}
+    files = _files(found, result, data_path, out, text)
     read = (data_path, data_path.with_suffix(".json"), into, config, *options.motion.also)
-    protected = [p for p in read if p is not None]
-    for path in files:
-        require_target(path, protected)
-    if into is not None:  # first, because it is the one that may be refused
-        write_changed(into, lambda before: with_friction_section(before, found.section, found.remarks))
-    for path, content in files.items():
-        replace_file(path, content)
-    output.result(found.shown, {**result, "files": [str(p) for p in files]})
+    _write(files, found, into, [path for path in read if path is not None])
+    output.result(found.shown, {**result, "files": [str(path) for path in files]})
     for path in ([into] if into is not None else []) + list(files):
         output.note(f"written: {path}")
     if into is not None and _not_compensated(into):
@@ -238,6 +215,48 @@ def identify(
     if report is not None:
         _write_page(report, found, text, data_path, output)
     return 0
+
+
+def _require_targets(into: Path | None, out: Path | None, report: Path | None, read: Sequence[Path]) -> None:
+    """`DataError` for a file that cannot be written, before minutes of computing."""
+    from jointctl.tools.configuration.load import shipped_config
+    from jointctl.tools.recording.report_page import check_target
+    from jointctl.tools.written_file import refuse_unwritable
+
+    if out is not None and out.suffix != ".toml":
+        raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
+    if report is not None:
+        check_target(report, read)
+    if into is not None and not into.exists() and shipped_config(into.name).exists():
+        hint = f"`jointctl new FILE --from {into.stem}` makes one of your own"
+        raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
+    if into is not None:
+        refuse_unwritable(into)
+
+
+def _files(found: _Found, result: dict[str, Any], data_path: Path, out: Path | None, text: str) -> dict[Path, bytes]:
+    """What is written besides the configuration: figures, the report as JSON, and `text` where `out` is named."""
+    from jointctl.tools.drawing import png
+
+    stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
+    files = {stem.with_name(f"{stem.name}{end}.png"): png(figure) for end, (figure, _) in found.pictures.items()}
+    files[stem.with_name(stem.name + ".report.json")] = json.dumps(result, indent=1, allow_nan=False).encode("utf-8")
+    if out is not None:
+        files[out] = text.encode("utf-8")
+    return files
+
+
+def _write(files: Mapping[Path, bytes], found: _Found, into: Path | None, protected: Sequence[Path]) -> None:
+    """The section goes into the configuration, if one is named, and the files are written beside it."""
+    from jointctl.tools.configuration.found_values import with_friction_section, write_changed
+    from jointctl.tools.written_file import replace_file, require_target
+
+    for path in files:
+        require_target(path, protected)
+    if into is not None:  # first, because it is the one that may be refused
+        write_changed(into, lambda before: with_friction_section(before, found.section, found.remarks))
+    for path, content in files.items():
+        replace_file(path, content)
 
 
 def _from_plateaus(
