@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jointctl.tools.output import Output
 
 _INERTIA_SLACK = 0.1  # by which joint.inertia_kgm2 may be outside of what the poses give, without a warning
+TOO_SMALL = "too small"  # a verdict
 
 
 def check(
@@ -43,38 +44,47 @@ def check(
         if figure is not None or choose_gains:
             raise UsageError("--figure and --choose-gains are for one joint's file, not for an arm's")
         return check_arm(config, output, delay_s, allow_low_margin=allow_low_margin)
-    from jointctl.tools.analysis.linear_loop import loop_settings
-    from jointctl.tools.analysis.loop_report import not_modelled, outside_payload_range
-    from jointctl.tools.analysis.margin_gate import (
-        learning_of,
-        meets,
-        refusal,
-        refuse_chatter,
-        refuse_diverging_learning,
-        remedies,
-    )
-    from jointctl.tools.analysis.margins import margins, theory
     from jointctl.tools.drawing import require_png
     from jointctl.tools.verbs.bench_drive import bench_of
 
     if figure is not None:
         require_png(figure, (config.path,))
-    drive = bench_of(config)
-    drive.require_rate(config)
+    bench_of(config).require_rate(config)
     if config.drive.own_loop() is not CommandKind.TORQUE:
         if figure is not None or choose_gains:
             raise UsageError("--figure and --choose-gains are for drive.mode cst, tq and auto")
         return check_cascade(config, output, delay_s, allow_low_margin=allow_low_margin)
+    analysis = _analysed(config, delay_s, allow_low_margin=allow_low_margin)
+    return _show(config, output, analysis, figure, allow_low_margin=allow_low_margin, choose_gains=choose_gains)
+
+
+def _analysed(config: Config, delay_s: float | None, *, allow_low_margin: bool) -> LoopCheck:
+    """Margins of the loop that is closed here, and what would help where they are too small."""
+    from jointctl.tools.analysis.linear_loop import loop_settings
+    from jointctl.tools.analysis.margin_gate import meets, remedies
+    from jointctl.tools.analysis.margins import margins, theory
+
     minimum_deg = config.margin.min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
     found = margins(settings)
     enough = meets(found, minimum_deg)
+    accepted = found.stable and allow_low_margin
+    verdict = "ok" if enough else "below the minimum, accepted" if accepted else TOO_SMALL
     changes = [] if enough else remedies(settings, minimum_deg)
-    accepted = enough or (found.stable and allow_low_margin)
-    verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
-    analysis = LoopCheck(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
-    table = _table(analysis)
-    for row in drive.check_rows(config):
+    return LoopCheck(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
+
+
+def _show(
+    config: Config, output: Output, analysis: LoopCheck, figure: Path | None, *, allow_low_margin: bool,
+    choose_gains: bool,
+) -> int:  # fmt: skip
+    """The table and what it leaves out; then the refusals, as `run` has them."""
+    from jointctl.tools.analysis.loop_report import not_modelled, outside_payload_range, save_loop_figure
+    from jointctl.tools.analysis.margin_gate import learning_of, refusal, refuse_chatter, refuse_diverging_learning
+    from jointctl.tools.verbs.bench_drive import bench_of
+
+    settings, table = analysis.settings, _table(analysis)
+    for row in bench_of(config).check_rows(config):
         table.add_row(*row)
     learning, warnings = learning_of(config, settings), _warnings(config)
     if learning is not None:
@@ -83,9 +93,7 @@ def check(
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
     chosen = _add_gains(table, config, settings) if choose_gains else None
     if figure is not None:
-        from jointctl.tools.analysis.loop_report import save_loop_figure
-
-        save_loop_figure(settings, figure, config.path.name, minimum_deg)
+        save_loop_figure(settings, figure, config.path.name, analysis.min_phase_margin_deg)
         table.add_row("picture", str(figure), "")
     data = {
         **_data(analysis, figure),
@@ -100,8 +108,8 @@ def check(
         output.note(f"not in this analysis: {text}")
     for text in outside_payload_range(config, settings):
         output.warning(text)
-    if not accepted:
-        raise refusal(settings, found, minimum_deg, changes)
+    if analysis.verdict == TOO_SMALL:
+        raise refusal(settings, analysis.margins, analysis.min_phase_margin_deg, analysis.remedies)
     if not allow_low_margin:
         refuse_chatter(config, settings)
     refuse_diverging_learning(learning)
@@ -169,7 +177,7 @@ def check_cascade(
     if found:
         enough = all(loop.stable and loop.phase_margin_deg >= wanted_deg for loop in found)
         wanted = f"at least {wanted_deg:g} deg wanted (margin.min_phase_margin_deg)"
-        table.add_row("verdict", "ok" if enough else "too small", wanted)
+        table.add_row("verdict", "ok" if enough else TOO_SMALL, wanted)
     warnings = _warnings(config)
     data = {
         "mode": section.mode, "lead_s": lead, "loops": [asdict(loop) for loop in found],
