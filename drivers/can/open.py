@@ -259,56 +259,64 @@ def open_python_can(
     not installed.  `exclusive` False: to switch the drive off although another program has the serial adapter.
     """
     place = f"{interface}:{channel}"
-    channel, options = split_channel(channel)
     if bitrate is not None:
         settings["bitrate"] = bitrate
-    if interface == "slcan":
-        settings.setdefault("sleep_after_open", SLCAN_SETTLE_S)
     try:
-        check_options(interface, options)
-        settings |= options
-        if interface == "jointctl":
-            return virtual_bus.VirtualBus(channel, **settings)
-        if interface == "socketcan":
-            # python-can binds to an interface that is down without a word: ask the kernel first.
-            socketcan.open_socket(channel).close()
-        if interface == "slcan":
-            with reserved_port(channel, exclusive=exclusive):
-                bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
-            if exclusive and "://" not in channel:
-                lock_port(bus.fileno(), port_path(channel))
-                keep_from_forks(bus)
-            return normalised(bus)
-        return normalised(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
+        return _opened(interface, channel, settings, exclusive=exclusive)
+    except BusError:
+        raise
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError
         known_interface(interface)
         raise BusError(
             f"interface {interface} cannot be used here: {error}", _remedy(interface, "install its driver")
         ) from None
-    except ImportError as error:
-        raise BusError(
-            f"interface {interface} needs a module that is not installed: {error}", _remedy(interface, "install it")
-        ) from None
-    except PermissionError:
-        remedy = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
-        raise BusError(f"no permission to open {place}", f"{remedy}; log in again") from None
-    except OSError as error:
-        if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
-            raise BusError(f"no such device: {place}", "plug in the adapter") from None
-        raise BusError(f"cannot open {place}: {error.strerror or error}") from None
-    except BusError:
-        raise
     except Exception as error:  # without its maker's library an interface raises NameError, AttributeError, ctypes' own
         if isinstance(error.__cause__, BusError):
             raise error.__cause__ from None
-        if isinstance(error, (can.CanError, ValueError, TypeError)):
-            raise BusError(f"cannot open {place}: {error}", _remedy(interface, "")) from None
-        hint = _remedy(interface, f"is the driver of {interface} installed?")
-        if isinstance(error, (NameError, AttributeError)):  # python-can goes on without it until the first call
-            lacks = "the library of the adapter's maker is not installed, or too old"
-            missing = f"{error.name} is missing" if error.name else str(error)
-            raise BusError(f"cannot open {place}: {lacks}: {missing}", hint) from None
-        raise BusError(f"cannot open {place}: {type(error).__name__}: {error}", hint) from None
+        raise _cannot_open(interface, place, error) from None
+
+
+def _opened(interface: str, channel: str, settings: dict[str, Any], *, exclusive: bool) -> can.BusABC:
+    channel, options = split_channel(channel)
+    check_options(interface, options)
+    if interface == "slcan":
+        settings.setdefault("sleep_after_open", SLCAN_SETTLE_S)
+    settings |= options
+    if interface == "jointctl":
+        return virtual_bus.VirtualBus(channel, **settings)
+    if interface == "socketcan":
+        # python-can binds to an interface that is down without a word: ask the kernel first.
+        socketcan.open_socket(channel).close()
+    if interface == "slcan":
+        with reserved_port(channel, exclusive=exclusive):
+            bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
+        if exclusive and "://" not in channel:
+            lock_port(bus.fileno(), port_path(channel))
+            keep_from_forks(bus)
+        return normalised(bus)
+    return normalised(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
+
+
+def _cannot_open(interface: str, place: str, error: Exception) -> BusError:
+    """In words, with what helps."""
+    if isinstance(error, ImportError):
+        text = f"interface {interface} needs a module that is not installed: {error}"
+        return BusError(text, _remedy(interface, "install it"))
+    if isinstance(error, PermissionError):
+        remedy = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
+        return BusError(f"no permission to open {place}", f"{remedy}; log in again")
+    if isinstance(error, OSError):
+        if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
+            return BusError(f"no such device: {place}", "plug in the adapter")
+        return BusError(f"cannot open {place}: {error.strerror or error}")
+    if isinstance(error, (can.CanError, ValueError, TypeError)):
+        return BusError(f"cannot open {place}: {error}", _remedy(interface, ""))
+    hint = _remedy(interface, f"is the driver of {interface} installed?")
+    if isinstance(error, (NameError, AttributeError)):  # python-can goes on without it until the first call
+        missing = f"{error.name} is missing" if error.name else str(error)
+        lacks = "the library of the adapter's maker is not installed, or too old"
+        return BusError(f"cannot open {place}: {lacks}: {missing}", hint)
+    return BusError(f"cannot open {place}: {type(error).__name__}: {error}", hint)
 
 
 @_without_its_log()
