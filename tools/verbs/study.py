@@ -88,12 +88,9 @@ def study(
     """
     from jointctl.tools.configuration.drive_section import require_simulated
     from jointctl.tools.configuration.load import load_config, shipped_config
-    from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.experiments.controller_study import random_plant, run_study, study_controllers, write_csv
+    from jointctl.tools.experiments.controller_study import random_plant, run_study, study_controllers
     from jointctl.tools.experiments.many_runs import HERE
     from jointctl.tools.experiments.scenarios import controller_config
-    from jointctl.tools.recording.report_page import check_target
-    from jointctl.tools.written_file import prepare_target, refuse_overwriting
 
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
@@ -102,15 +99,7 @@ def study(
         raise ConfigurationError(
             f"base (={settings.base}) has a [reducer], and rigid joints are drawn: --plants realistic"
         )
-    inputs = [Path(name) for name in (settings.base, *settings.controllers)] + ([file] if file is not None else [])
-    if csv is not None:
-        refuse_overwriting(csv, inputs)
-    if figure is not None:
-        require_png(figure, inputs)
-    if report is not None:
-        check_target(report, inputs)
-    for target in (csv, figure):
-        prepare_target(target)
+    _require_targets(settings, file, csv, figure, report)
     controllers, joint = study_controllers(settings), random_plant(base, settings.plant, settings.seed, 0)
     for controller in controllers:
         controller_config(joint, controller)  # a contradiction is to be reported before an hour of simulation
@@ -130,15 +119,43 @@ def study(
     if done:
         # first of all: a file that cannot be written does not cost the result
         output.result(_table(result, title, settings.after_s), study_data(result, settings), result)
-        if csv is not None:
-            write_csv(result, csv)
-            output.note(f"written: {csv}")
-        if figure is not None:
-            save_png(_figure(result, settings, title), figure)
-            output.note(f"written: {figure}")
+        _write(result, settings, title, csv, figure, output)
         if report is not None:
             _write_page(report, result, settings, title, output)
     return INTERRUPTED if result.interrupted else 0
+
+
+def _require_targets(
+    settings: StudySettings, file: Path | None, csv: Path | None, figure: Path | None, report: Path | None
+) -> None:
+    """`DataError` for a file that cannot be written, before an hour of simulation."""
+    from jointctl.tools.drawing import require_png
+    from jointctl.tools.recording.report_page import check_target
+    from jointctl.tools.written_file import prepare_target, refuse_overwriting
+
+    inputs = [Path(name) for name in (settings.base, *settings.controllers)] + ([file] if file is not None else [])
+    if csv is not None:
+        refuse_overwriting(csv, inputs)
+    if figure is not None:
+        require_png(figure, inputs)
+    if report is not None:
+        check_target(report, inputs)
+    for target in (csv, figure):
+        prepare_target(target)
+
+
+def _write(
+    result: StudyResult, settings: StudySettings, title: str, csv: Path | None, figure: Path | None, output: Output
+) -> None:
+    from jointctl.tools.drawing import save_png
+    from jointctl.tools.experiments.controller_study import write_csv
+
+    if csv is not None:
+        write_csv(result, csv)
+        output.note(f"written: {csv}")
+    if figure is not None:
+        save_png(_figure(result, settings, title), figure)
+        output.note(f"written: {figure}")
 
 
 def size_warnings(base: Config, settings: StudySettings) -> list[str]:
