@@ -240,9 +240,12 @@ _PLUGS_REMEDY = "swap the cables of the two encoders, or which object of the dri
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
 LOOSE = 0.2  # of the way that it came: less may be the bristles of friction that holds it
-HEAVY_radps2 = 3.5  # torque over the inertia, below which a joint moves visibly only long after friction has let it go
-LEAST_OF_HEAVY = 0.25  # of that torque, is friction: the inertia is not seen well
+HEAVY_radps2 = 6.0  # torque over the inertia, below which a joint moves visibly only long after friction has let it go
+LEAST_OF_HEAVY = 0.1  # of the torque by then, is friction: less is none, the slide is not seen well
 BEGUN = 0.05  # of the way at which it has begun to move, where it slides
+ACTS_CYCLES = 2  # after the sample that it was computed from, a torque is seen in the next speed
+SLOW_AGAIN = 0.3  # of its greatest speed, where the slide ends
+STATIC_SHARE = 1.2  # of the friction of a slide: what let it go was more
 SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 HELD_s = 0.1  # so long a joint stands that the spring holds against a load
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
@@ -303,7 +306,7 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     return np.convolve(values, np.ones(cycles) / cycles, "valid")
 
 
-def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, inertia_kgm2: float = 0.0) -> Motion | None:
+def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> Motion | None:
     """None if the drive was never enabled; without `inertia_kgm2`, the most it may be, no joint is a heavy one."""
     rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
@@ -326,7 +329,7 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
         accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
-        break_away_Nm=_break_away_Nm(rows, way, pushed, first, inertia_kgm2),
+        break_away_Nm=_break_away_Nm(rows, way, pushed, first),
         torque_max_Nm=float(np.abs(smooth).max()),
         torque_ratio=ratio,
         other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
@@ -335,34 +338,39 @@ def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int, iner
     )
 
 
-def _break_away_Nm(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int, inertia_kgm2: float) -> float:
-    """Of the torques (N,) up to the row `first` of the way (N,) that counts as motion; -1: of all, it did not move."""
+def _break_away_Nm(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> float:
+    """Of the torques (N,) up to the row `first` of the way (N,) that counts as motion; -1: of all, it did not move.
+
+    By then a heavy joint is under far more torque than let it go: it needs as much as it slides under, and a little.
+    """
     # a count of a coarse encoder is a kick of many Nm, too short to move anything
     most_Nm = float(np.abs(_smoothed(pushed[: first + 1 or None])).max())
     if first <= 0:
         return most_Nm
-    inertia_kgm2 = min(inertia_kgm2, _seen_inertia_kgm2(rows, way, pushed, first))
-    if most_Nm >= HEAVY_radps2 * inertia_kgm2:
-        return most_Nm
-    # by then most of the work has gone into its speed
-    speed = float(np.mean(rows.velocity_radps[max(first - 4, 0) : first + 1]))
-    done_J = float(np.sum(pushed[:first] * np.diff(way[: first + 1]))) - 0.5 * inertia_kgm2 * speed * speed
-    return min(max(done_J / abs(way[first]), LEAST_OF_HEAVY * most_Nm), most_Nm)
+    sliding_Nm, inertia_kgm2 = _slide(rows, way, pushed, first)
+    held_Nm, heavy = STATIC_SHARE * sliding_Nm, most_Nm < HEAVY_radps2 * inertia_kgm2
+    return held_Nm if heavy and LEAST_OF_HEAVY * most_Nm < held_Nm < most_Nm else most_Nm
 
 
-def _seen_inertia_kgm2(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> float:
-    """From how the speed of the first slide goes with impulse and time, under constant friction; 0 where it does not.
+def _slide(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> tuple[float, float]:
+    """Friction [Nm] and inertia [kg m^2] of the first slide, until it is slow again: J q'' = u - F, summed up twice.
 
-    That of the file may be many times too large: a light joint would lose most of its friction to it.
+    The inertia is 0 where they cannot be told; that of the file may be many times wrong.
     """
     begin = int(np.argmax(np.abs(way) >= BEGUN * abs(way[first])))
-    speeds = np.abs(rows.velocity_radps[begin : 3 * first - 2 * begin + SMOOTHED_CYCLES])
-    slide = slice(begin, max(begin + int(np.argmax(speeds)), first) + 1)
+    speed = np.asarray(rows.velocity_radps[begin:]) * np.sign(way[first])
+    slow = speed < SLOW_AGAIN * np.maximum.accumulate(speed)
+    slow[: first - begin + 1] = False
+    slide = slice(begin, begin + int(np.argmax(slow)) if slow.any() else len(way))
     time_s = (rows.time_ns[slide] - rows.time_ns[begin]) * 1e-9
-    impulse = np.cumsum(pushed[slide] * np.diff(time_s, prepend=0.0))
-    columns = np.column_stack((impulse, time_s, np.ones(len(time_s))))
-    per_kgm2 = float(np.linalg.lstsq(columns, rows.velocity_radps[slide], rcond=None)[0][0])
-    return 1.0 / per_kgm2 if per_kgm2 > 0.0 else 0.0
+    step_s = np.diff(time_s, prepend=0.0)
+    acting = np.roll(pushed, ACTS_CYCLES)[slide] * np.sign(way[first])
+    twice = np.cumsum(np.cumsum(acting * step_s) * step_s)
+    columns = np.column_stack((twice, 0.5 * time_s**2, time_s, np.ones(len(time_s))))
+    per_Nm, per_s2, *_ = (
+        float(one) for one in np.linalg.lstsq(columns, way[slide] * np.sign(way[first]), rcond=None)[0]
+    )
+    return (-per_s2 / per_Nm, 1.0 / per_Nm) if per_Nm > 0.0 else (0.0, 0.0)
 
 
 def _held_Nm(way: np.ndarray, torque: np.ndarray, threshold_rad: float, cycles: int) -> float:
@@ -388,7 +396,7 @@ def motion_findings(
     threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * law_resolution_rad(config))
     # a reading that stands still ends the check before it has stood for long
     held_cycles = 1 if fault is Fault.POSITION_FROZEN else round(HELD_s * config.loop.rate_Hz)
-    motion = motion_of(records, threshold_rad, held_cycles, config.joint.inertia_kgm2)
+    motion = motion_of(records, threshold_rad, held_cycles)
     if motion is None:
         misplaced = fault in (Fault.POSITION_DISAGREEMENT, Fault.POSITION_LIMIT)
         if misplaced and len(records) and records.position_rad[-1]:
