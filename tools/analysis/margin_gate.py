@@ -269,6 +269,15 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
         )
 
 
+def chatters(config: Config) -> bool:
+    """Whether the gate refuses the loop for one count of an encoder."""
+    try:
+        refuse_chatter(config, loop_settings(config)[0])
+    except MarginError:
+        return True
+    return False
+
+
 def meets(found: Margins, minimum_deg: float) -> bool:
     return found.stable and found.phase_margin_deg >= minimum_deg and found.sensitivity_accepted
 

@@ -21,7 +21,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, text_Nm, text_radps
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import eased, spline_table
-from jointctl.tools.analysis.margin_gate import passes
+from jointctl.tools.analysis.margin_gate import chatters, passes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
     joint_rad_per_count,
@@ -57,6 +57,7 @@ PUSHED_FRICTION = 1.4  # static frictions at least: friction may be greater than
 MOST_PUSH = 0.95  # of the torque limit, where gravity takes nearly all of it
 STANDING_WAY = 1.2  # travels of the reference past a reading that stands still
 DAMPING = 0.5
+FILTER_OF_SPRING = 10.0  # times its natural frequency, the velocity filter at least where counts are coarse
 RAMP_s, REST_s = 0.4, 0.4  # a longer travel takes a longer ramp
 STOPS = (1.0, 0.0, -1.0, 0.0)  # where the reference goes, in travels
 _ROWS_PER_RAMP = 16
@@ -146,7 +147,10 @@ def config_of_check(config: Config, plan: CheckPlan) -> Config:
         "kind": "computed_torque", "kp": kp, "kv": 2.0 * DAMPING * math.sqrt(kp), "feed_forward": "none",
         "learning": None,
     }  # fmt: skip
-    return config.changed(limits=limits, control=control, drive=config.drive.free_of_torque_limit())
+    made = config.changed(limits=limits, control=control, drive=config.drive.free_of_torque_limit())
+    while chatters(made) and made.control.velocity_cutoff_Hz > FILTER_OF_SPRING * math.sqrt(kp) / math.pi:
+        made = made.changed(control__velocity_cutoff_Hz=0.5 * made.control.velocity_cutoff_Hz)
+    return made
 
 
 def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:

@@ -458,7 +458,7 @@ class Tune:
         self._require(self.gains)
         return self._kept(self.gains)
 
-    def _require_same_joint(self, when: str, *, surely: bool = False) -> None:
+    def _require_same_joint(self, when: str) -> None:
         assert self.fit is not None
         assert self.response is not None
         law = self.state["response"].get("law", ALONE)
@@ -466,8 +466,6 @@ class Tune:
         try:
             require_same_joint(task, self.carrier, self.response.peak_Nm, self.fit, when)
         except (MarginError, TooWeak) as error:  # the law of the response, on the joint that is known now
-            if surely:
-                raise
             self.carrier.output.warning(f"whether it is the same joint {when} is not measured: {error.message}")
 
     @staticmethod
@@ -510,7 +508,7 @@ class Tune:
             return {**found, "before_refused": error.message}
         found["before"] = self._verified(before, "the same before")
         if found["before"].get("fault") == Fault.POSITION_FROZEN.name:  # by a wrong friction, or by a dead encoder
-            self._require_same_joint("after the old gains", surely=True)
+            self._verified(self.config, "verification once more")
         return found
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
