@@ -7,13 +7,15 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Friction, FrictionDirection, FrictionTemperature, Section
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, FrictionTemperature, Reducer, Section
 
 if TYPE_CHECKING:
     from jointctl.firmware_py.records import FrictionConstants, HarmonicSeries
 
 
 RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
+TWIST_SHARE = 0.35  # of what a soft reducer's twist may reach, where a motion that measures turns round or is excited
+SWINGS_s = 0.125  # period of a link that still swings where a plateau begins to be measured
 HELD_BEYOND_K = 40.0  # of the reference: the factors of friction are held there where no range is given
 
 
@@ -61,13 +63,44 @@ def law_resolution_rad(config: Config) -> float:
 
 
 def velocity_of_a_count_radps(config: Config) -> float:
-    """What the filter of the velocity (`firmware_py.axis`) gives when the encoder counts one on.
+    """What the filter of the velocity (`firmware_py.axis`) gives when the encoder counts one on."""
+    return velocity_of_a_step_1ps(config) * law_resolution_rad(config)
+
+
+def velocity_of_a_step_1ps(config: Config) -> float:
+    """What that filter gives at once for a step of the position, over the step.
 
     Without its compiled function, which takes 0.2 s to load: a configuration is read by every verb.
     """
     cutoff_Hz, rate_Hz = config.control.velocity_cutoff_Hz, config.loop.rate_Hz
-    gain = -math.expm1(-math.tau * cutoff_Hz / rate_Hz) if cutoff_Hz else 1.0
-    return gain * law_resolution_rad(config) * rate_Hz
+    return rate_Hz * (-math.expm1(-math.tau * cutoff_Hz / rate_Hz) if cutoff_Hz else 1.0)
+
+
+def link_period_s(config: Config, reducer: Reducer) -> float:
+    """Of the heaviest link on a soft reducer whose motor stands still."""
+    return math.tau * math.sqrt(config.margin.payload_range[1] * config.link_kgm2 / reducer.stiffness_Nmprad)
+
+
+def turning_of(config: Config, acceleration_radps2: float) -> tuple[float, float]:
+    """(acceleration, time in which it changes) of a motion that measures, which may have that acceleration.
+
+    It twists a soft reducer by J_l / K of it: by TWIST_SHARE of joint_encoder.disagreement_max_rad at most.  Where it
+    jumps the law of a flexible joint, which compares the motor with that twist at once, answers with J (kp + kv filter)
+    of it, and the link swings about it: it changes within a period of the link where that is more than TWIST_SHARE of
+    limits.torque_max_Nm, or where the link is slow to come to rest.  0: it may jump.
+    """
+    reducer, second, control = config.reducer, config.joint_encoder, config.control
+    if reducer is None:
+        return acceleration_radps2, 0.0
+    twist_s2 = config.link_kgm2 / reducer.stiffness_Nmprad
+    if second is not None:
+        acceleration_radps2 = min(acceleration_radps2, TWIST_SHARE * second.disagreement_max_rad / twist_s2)
+    rounding_s, answered_Nm = link_period_s(config, reducer), 0.0
+    if control.kind == "flexible_joint" and (second is not None or config.encoder.side == "motor"):
+        answered_ps2 = control.kp + control.kv * velocity_of_a_step_1ps(config)
+        answered_Nm = config.joint.inertia_kgm2 * answered_ps2 * twist_s2 * acceleration_radps2
+    jumps = rounding_s < SWINGS_s and answered_Nm <= TWIST_SHARE * config.limits.torque_max_Nm
+    return acceleration_radps2, 0.0 if jumps else rounding_s
 
 
 def friction_constants(friction: Friction, reduction_ratio: float) -> Any:

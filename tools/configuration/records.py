@@ -45,6 +45,7 @@ from jointctl.tools.configuration.conversions import (
     fill_series,
     friction_constants,
     law_resolution_rad,
+    link_period_s,
     period_s,
     static_friction_Nm,
 )
@@ -348,8 +349,7 @@ def _rounding_s(config: Config, trajectory: Trapezoid) -> float:
         return max(trajectory.acceleration_radps2 / trajectory.jerk_radps3, ROUNDING_CYCLES * period_s(config))
     if reducer is None:
         return 0.0
-    link_kgm2 = config.margin.payload_range[1] * config.link_kgm2
-    return math.tau * math.sqrt(link_kgm2 / reducer.stiffness_Nmprad)
+    return link_period_s(config, reducer)
 
 
 def _cycles(config: Config, time_s: float) -> int:

@@ -254,7 +254,8 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
     ),
     Fault.POSITION_DISAGREEMENT: FaultWords(
         "the two encoders of the joint differ by {value:.4f} rad (the other one minus the one that feeds the law)",
-        "one encoder or its cable, a slipping coupling, or zero, counts, direction or reduction_ratio of one are wrong",
+        "one encoder or its cable, a slipping coupling, zero, counts, direction or reduction_ratio of one are wrong, "
+        "or a soft reducer twists by more than disagreement_max_rad",
         "turn the joint by hand with the power off and compare both; see [encoder] and [joint_encoder]",
     ),
     Fault.MOVED_BEFORE_START: FaultWords(

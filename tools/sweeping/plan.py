@@ -11,7 +11,8 @@ periods of the ripple, so that it averages out:
   the first harmonics of the ripple as well.
 
 Positions are relative to the middle of the motion.  The table has the rows of `trajectory.reference_at`: constant
-acceleration and constant speed are cubics, so nothing is approximated.  The acceleration jumps, as a trapezoid's does.
+acceleration and constant speed are cubics, so nothing is approximated.  The acceleration jumps, as a trapezoid's does,
+or changes within the period of the link where the jump would twist a soft reducer too much (`conversions.turning_of`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
     joint_rad_per_count,
     torque_constant_NmpA,
+    turning_of,
     velocity_of_a_count_radps,
 )
 from jointctl.tools.sweeping.options import (
@@ -65,6 +67,7 @@ class PlanSettings:
     reduction_ratio: float
     ripple_per_joint_turn: float = 18.0
     ripple_per_motor_turn: float = 2.0
+    rounding_s: float = 0.0  # in which the acceleration changes
 
     @property
     def joint_period_rad(self) -> float:
@@ -115,9 +118,14 @@ def _lead_rad(speed_radps: float, s: PlanSettings) -> float:
     return speed_radps * s.settle_s + LEAD_rad
 
 
-def _ramps_rad(speed_radps: float, s: PlanSettings) -> float:
-    """Distance of speeding up and of braking."""
-    return speed_radps * speed_radps / s.acceleration_radps2
+def _ramp_s(change_radps: float, s: PlanSettings) -> float:
+    """Time of a change of the speed; no quicker than the acceleration may change."""
+    return max(change_radps / s.acceleration_radps2, s.rounding_s) + s.rounding_s if change_radps else 0.0
+
+
+def _ramps_rad(speed_radps: float, s: PlanSettings, slow_radps: float = 0.0) -> float:
+    """Distance of speeding up from `slow_radps` and of braking to it."""
+    return (speed_radps + slow_radps) * _ramp_s(speed_radps - slow_radps, s)
 
 
 ROUNDING = 1e-6  # the highest speed must fit in spite of rounding
@@ -133,9 +141,11 @@ def fastest_radps(s: PlanSettings) -> float:
     for window in (s.joint_period_rad, s.motor_period_rad):
         left = s.width_rad - LEAD_rad - window
         if left > 0.0:
-            # v^2 / a + v settle = left
-            half = 0.5 * s.settle_s * s.acceleration_radps2
+            # v^2 / a + v (rounding + settle) = left, or v (2 rounding + settle) = left of a short ramp
+            half = 0.5 * (s.rounding_s + s.settle_s) * s.acceleration_radps2
             exact = math.sqrt(half * half + left * s.acceleration_radps2) - half
+            if exact < s.acceleration_radps2 * s.rounding_s:
+                exact = left / (2.0 * s.rounding_s + s.settle_s)
             return exact * (1.0 - ROUNDING)
     raise UsageError(
         f"the travel (={s.width_rad:.4f} rad) must be more than {s.motor_period_rad + LEAD_rad:.4f} rad, one ripple "
@@ -180,19 +190,28 @@ class MotionBuilder:
         self.t_s, self.q_rad, self.v_radps = 0.0, 0.0, 0.0
         self.low_rad, self.high_rad = 0.0, 0.0
 
-    def _row(self, duration_s: float, acceleration: float) -> None:
-        if duration_s <= 0.0:
+    def _row(self, duration_s: float, acceleration: float, jerk: float = 0.0) -> None:
+        if self.t_s + duration_s <= self.t_s:  # of rounding alone, too
             return
-        self._rows.append((self.t_s, self.q_rad, self.v_radps, 0.5 * acceleration, 0.0))
-        self.q_rad += duration_s * (self.v_radps + 0.5 * acceleration * duration_s)
+        self._rows.append((self.t_s, self.q_rad, self.v_radps, 0.5 * acceleration, jerk / 6.0))
+        self.q_rad += duration_s * (self.v_radps + duration_s * (0.5 * acceleration + jerk * duration_s / 6.0))
         self.t_s += duration_s
         self.low_rad, self.high_rad = min(self.low_rad, self.q_rad), max(self.high_rad, self.q_rad)
 
     def ramp(self, velocity_radps: float) -> None:
-        """To another velocity at the acceleration of the plan."""
-        change = velocity_radps - self.v_radps
-        acceleration = math.copysign(self._s.acceleration_radps2, change)
-        self._row(abs(change) / self._s.acceleration_radps2, acceleration)
+        """To another velocity at the acceleration of the plan, which changes within `rounding_s`."""
+        change, rounding_s = velocity_radps - self.v_radps, self._s.rounding_s
+        if change and rounding_s:
+            level_s = max(abs(change) / self._s.acceleration_radps2 - rounding_s, 0.0)
+            acceleration = change / (level_s + rounding_s)
+            jerk = acceleration / rounding_s
+            for duration_s, begin, slope in (
+                (rounding_s, 0.0, jerk), (level_s, acceleration, 0.0), (rounding_s, acceleration, -jerk)
+            ):  # fmt: skip
+                self._row(duration_s, begin, slope)
+                self.v_radps += duration_s * (begin + 0.5 * slope * duration_s)
+        else:
+            self._row(abs(change) / self._s.acceleration_radps2, math.copysign(self._s.acceleration_radps2, change))
         self.v_radps = velocity_radps
 
     def cruise(self, distance_rad: float) -> tuple[float, float]:
@@ -201,14 +220,23 @@ class MotionBuilder:
         self._row(distance_rad / abs(self.v_radps), 0.0)
         return start_s, self.t_s
 
+    def _peak_radps(self, distance_rad: float, slow: float) -> float:
+        """Whose ramps from and to the speed `slow` take the distance; no less than `slow`."""
+        a, rounding_s = self._s.acceleration_radps2, self._s.rounding_s
+        half = 0.5 * a * rounding_s
+        peak = math.sqrt(max((slow - half) ** 2 + a * distance_rad, 0.0)) - half
+        if peak - slow < a * rounding_s:
+            peak = 0.5 * distance_rad / rounding_s - slow
+        return max(peak, slow)
+
     def rest(self, duration_s: float) -> None:
         self._row(duration_s, 0.0)
 
     def hop(self, distance_rad: float) -> None:
         """Quickly over a distance > 0 in the direction of motion, at the present speed again at its end."""
-        slow, a = self.v_radps, self._s.acceleration_radps2
-        peak = min(math.sqrt(slow * slow + a * distance_rad), max(self._s.transit_radps, abs(slow)))
-        ramps = (peak * peak - slow * slow) / a
+        slow = self.v_radps
+        peak = min(self._peak_radps(distance_rad, abs(slow)), max(self._s.transit_radps, abs(slow)))
+        ramps = _ramps_rad(peak, self._s, abs(slow))
         self.ramp(math.copysign(peak, slow))
         if distance_rad > ramps:
             self.cruise(distance_rad - ramps)
@@ -218,11 +246,11 @@ class MotionBuilder:
         """From rest to rest."""
         distance = target_rad - self.q_rad
         if abs(distance) > 1e-12:
-            a = self._s.acceleration_radps2
-            peak = min(math.sqrt(a * abs(distance)), self._s.transit_radps)
+            peak = min(self._peak_radps(abs(distance), 0.0), self._s.transit_radps)
+            ramps = _ramps_rad(peak, self._s)
             self.ramp(math.copysign(peak, distance))
-            if abs(distance) > peak * peak / a:
-                self.cruise(abs(distance) - peak * peak / a)
+            if abs(distance) > ramps:
+                self.cruise(abs(distance) - ramps)
             self.ramp(0.0)
             self.q_rad = target_rad  # rounding does not add up
 
@@ -356,11 +384,12 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
     wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
     dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
     allowed = fastest_allowed_radps(config)
+    acceleration_radps2, rounding_s = turning_of(config, ACCELERATION_SHARE * config.sequence.brake_radps2)
 
     def settings(transit_radps: float) -> PlanSettings:
         return PlanSettings(
-            width, ACCELERATION_SHARE * config.sequence.brake_radps2, transit_radps, dwell_s, SETTLE_S,
-            config.joint.reduction_ratio,
+            width, acceleration_radps2, transit_radps, dwell_s, SETTLE_S, config.joint.reduction_ratio,
+            rounding_s=rounding_s,
         )  # fmt: skip
 
     reachable = min(allowed, fastest_radps(settings(allowed)))
@@ -394,7 +423,10 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
     other: dict[str, float] = {"warm_between_turns": options.warm_between_turns} if options.warm_between_turns else {}
     if options.lockstep:  # what was simulated and what was measured are two sweeps
         other["simulated"] = True
-    identity = plan_hash(points, asdict(chosen) | measuring_constants(config) | other)
+    shape = asdict(chosen)
+    if not rounding_s:  # the identity of a motion that was begun before there was a rounded one
+        del shape["rounding_s"]
+    identity = plan_hash(points, shape | measuring_constants(config) | other)
     return SweepPlan(points, chosen, identity, options.warm_between_turns)
 
 

@@ -18,6 +18,7 @@ G is that of the sampled joint, from a command to a later sample, with delay and
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,8 +30,10 @@ from scipy import signal, stats
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DataError, UsageError, text_Nm, text_radps
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
+from jointctl.tools.analysis.gains import LEAST_DAMPING
+from jointctl.tools.analysis.linear_loop import two_masses
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
+from jointctl.tools.configuration.conversions import TWIST_SHARE, period_s, static_friction_Nm, turning_of
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
@@ -90,6 +93,7 @@ class Multisine:
     wave: np.ndarray  # (N,)
 
 
+@functools.lru_cache(maxsize=4)
 def multisine(rate_Hz: float, length_s: float) -> Multisine:
     """Lines from LOWEST_Hz to a quarter of the rate, even steps of the logarithm, phases with a low peak."""
     samples = round(rate_Hz * length_s)
@@ -129,23 +133,29 @@ def room_rad(config: Config) -> float:
     return limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
 
 
-def _length_rad(speed_radps: float, period_s_: float, acceleration: float) -> float:
-    return speed_radps * (SETTLE_s + period_s_) + speed_radps * speed_radps / acceleration
+def _turning(config: Config) -> tuple[float, float]:
+    """(acceleration where the triangle turns round, time in which it changes)."""
+    return turning_of(config, ACCELERATION_SHARE * config.sequence.brake_radps2)
+
+
+def _length_rad(speed_radps: float, period_s_: float, turning: tuple[float, float]) -> float:
+    acceleration, rounded_s = turning
+    return speed_radps * (SETTLE_s + period_s_ + rounded_s + max(speed_radps / acceleration, rounded_s))
 
 
 def speed_and_period(config: Config) -> tuple[float, float]:
     """(speed of the triangle, period of the multisine) that the travel allows; `UsageError` where it is too short."""
-    acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
+    turning = _turning(config)
     width = room_rad(config)
     fastest = min(SPEED_radps, VELOCITY_SHARE * config.limits.velocity_max_radps)
     wanted = ((PERIOD_s, 0.7 * SPEED_radps), (SHORT_PERIOD_s, USUAL_SPEED_radps), (SHORT_PERIOD_s, LEAST_SPEED_radps))
     for length_s, least in wanted:
         speed = fastest  # where it is less than wanted, this one alone is tried before the last
         while speed >= min(least, max(fastest, LEAST_SPEED_radps)):
-            if _length_rad((1.0 + SPEED_SPREAD) * speed, length_s, acceleration) <= width:
+            if _length_rad((1.0 + SPEED_SPREAD) * speed, length_s, turning) <= width:
                 return speed, length_s
             speed *= 0.98
-    needed = _length_rad((1.0 + SPEED_SPREAD) * LEAST_SPEED_radps, SHORT_PERIOD_s, acceleration)
+    needed = _length_rad((1.0 + SPEED_SPREAD) * LEAST_SPEED_radps, SHORT_PERIOD_s, turning)
     raise UsageError(
         f"the travel (={width:.4g} rad) must be at least {needed:.3g} rad, and {VELOCITY_SHARE:g} of "
         f"limits.velocity_max_radps (={VELOCITY_SHARE * config.limits.velocity_max_radps:.3g} rad/s) at least "
@@ -156,20 +166,23 @@ def speed_and_period(config: Config) -> tuple[float, float]:
 def legs_of(config: Config, pairs: int) -> Legs:
     """`pairs` of legs there and back, each pair at a speed of its own."""
     speed, length_s = speed_and_period(config)
-    acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
+    acceleration, rounded_s = _turning(config)
     rate = config.loop.rate_Hz
+    rounded = round(rounded_s * rate)
     factors = 1.0 + SPEED_SPREAD * np.linspace(-1.0, 1.0, max(pairs, 2))[:pairs]
     np.random.default_rng(SEED).shuffle(factors)
     parts, starts, count, widths = [np.zeros(round(FADE_s * rate))], [], round(FADE_s * rate), []
     for factor in factors:
         top = float(factor * speed)
-        ramp = max(round(top / acceleration * rate), 1)
-        cruise = round((SETTLE_s + length_s) * rate)
+        ramp = max(round(top / acceleration * rate), rounded, 1)
+        cruise = round((SETTLE_s + length_s) * rate) + rounded
         up = top * (np.arange(ramp) + 1.0) / ramp
         leg = np.concatenate((up, np.full(cruise, top), up[::-1] - top / ramp))
+        if rounded:
+            leg = np.convolve(leg, np.full(rounded, 1.0 / rounded))
         widths.append(float(np.sum(leg)) / rate)
         for side in (1.0, -1.0):
-            starts.append(count + ramp + round(SETTLE_s * rate))
+            starts.append(count + ramp + rounded + round(SETTLE_s * rate))
             parts.append(side * leg)
             count += len(leg)
     parts.append(np.zeros(round(FADE_s * rate)))
@@ -220,8 +233,30 @@ def largest_peak_Nm(config: Config) -> float:
             f"the torque (={limit:g} Nm) must be more than {holds * 1.05:.3g} Nm, what friction and gravity of the "
             "configuration take: --torque, limits.torque_max_Nm"
         )
-    slower = min(speed_and_period(config)[0] / USUAL_SPEED_radps, 1.0)
-    return min(peak, LARGEST_radps2 * slower * config.joint.inertia_kgm2)
+    speed, length_s = speed_and_period(config)
+    slower = min(speed / USUAL_SPEED_radps, 1.0)
+    return min(peak, LARGEST_radps2 * slower * config.joint.inertia_kgm2, _peak_of_twist_Nm(config, length_s))
+
+
+def _peak_of_twist_Nm(config: Config, length_s: float) -> float:
+    """With which both encoders differ by TWIST_SHARE of what they may, where [reducer] is known; else inf.
+
+        twist = torque / (J_m s^2 + (D s + K) (1 + J_m / J_l))
+
+    The stiffness that is believed may be wrong by margin.stiffness_error.
+    """
+    reducer, second = config.reducer, config.joint_encoder
+    if reducer is None or second is None:
+        return math.inf
+    sine, twist_radpNm = multisine(config.loop.rate_Hz, length_s), 0.0
+    s = math.tau * 1j * np.arange(len(sine.wave) // 2 + 1) / length_s
+    for factor in (1.0 - config.margin.stiffness_error, 1.0, 1.0 + config.margin.stiffness_error):
+        joint = two_masses(config, reducer, 1.0, factor, False)
+        damping = max(joint.damping_Nmspr, LEAST_DAMPING * joint.critical_Nmspr)
+        spring = (damping * s + joint.stiffness_Nmprad) * (1.0 + joint.motor_kgm2 / joint.link_kgm2)
+        twist = np.fft.irfft(np.fft.rfft(sine.wave) / (joint.motor_kgm2 * s * s + spring), len(sine.wave))
+        twist_radpNm = max(twist_radpNm, float(np.max(np.abs(twist))))
+    return TWIST_SHARE * second.disagreement_max_rad / twist_radpNm
 
 
 def config_of_response(config: Config, torque_Nm: float | None, law: ResponseLaw | None = WEAK) -> Config:

@@ -86,11 +86,14 @@ def points_of(speeds: list[float], passes: int = 1) -> list[SweepPoint]:
     settle=st.floats(0.0, 0.5),
     shares=st.lists(st.floats(0.001, 1.0), min_size=1, max_size=4, unique=True),
     warm_up=st.floats(0.0, 1.0),
+    rounding=st.just(0.0) | st.floats(0.005, 0.5),
 )
 def test_any_plan_stays_inside_travel_speed_and_acceleration(
-    width: float, acceleration: float, dwell: float, settle: float, shares: list[float], warm_up: float
+    width: float, acceleration: float, dwell: float, settle: float, shares: list[float], warm_up: float, rounding: float
 ) -> None:
-    s = plan_settings(width_rad=width, acceleration_radps2=acceleration, dwell_s=dwell, settle_s=settle)
+    s = plan_settings(
+        width_rad=width, acceleration_radps2=acceleration, dwell_s=dwell, settle_s=settle, rounding_s=rounding
+    )
     fastest = min(fastest_radps(s), 10.0)
     speeds = sorted(share * fastest for share in shares)
     motion = plan_motion(points_of(speeds), s, warm_up)
@@ -111,8 +114,10 @@ def test_any_plan_stays_inside_travel_speed_and_acceleration(
     assert visited == {signed for speed in speeds for signed in (speed, -speed)}
 
 
-def test_the_table_is_continuous_in_position_and_velocity_and_starts_and_ends_at_rest() -> None:
-    motion = plan_motion(points_of([0.004, 0.05, 0.5, 3.4]), plan_settings(), 0.5)
+@pytest.mark.parametrize("rounding_s", [0.0, 0.05, 0.5])
+def test_the_table_is_continuous_in_position_and_velocity_and_starts_and_ends_at_rest(rounding_s: float) -> None:
+    """With a time to change in the acceleration is continuous as well, and takes that long to its peak at least."""
+    motion = plan_motion(points_of([0.004, 0.05, 0.5, 2.4]), plan_settings(rounding_s=rounding_s), 0.5)
     steps = np.diff(motion.table[:, 0])
     c0, c1, c2, c3 = motion.table[:-1, 1:].T
     ends = c0 + steps * (c1 + steps * (c2 + steps * c3))
@@ -122,6 +127,10 @@ def test_the_table_is_continuous_in_position_and_velocity_and_starts_and_ends_at
     assert np.max(np.abs(speeds - motion.table[1:, 2])) < 1e-9
     assert motion.table[0, 2] == 0.0
     assert motion.table[-1, 2] == 0.0
+    if rounding_s:
+        accelerations = 2.0 * c2 + 6.0 * c3 * steps
+        assert np.max(np.abs(accelerations - 2.0 * motion.table[1:, 3])) < 1e-9
+        assert np.max(np.abs(6.0 * c3)) <= 4.0 / rounding_s * (1.0 + 1e-9)
 
 
 def test_exactly_one_window_completes_each_point() -> None:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.states import Fault
@@ -14,7 +15,7 @@ from jointctl.tools.analysis.gains import BELIEVED, choose_gains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import refuse_chatter
 from jointctl.tools.configuration.config import Adaptation, Config
-from jointctl.tools.configuration.conversions import static_friction_Nm
+from jointctl.tools.configuration.conversions import static_friction_Nm, turning_of, velocity_of_a_step_1ps
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.experiments.controller_study import EnsembleSettings, StudySettings
 from jointctl.tools.inspection.health import PROBLEM
@@ -28,6 +29,8 @@ from jointctl.tools.tuning.frequency_response import (
     USUAL_SPEED_radps,
     config_of_response,
     largest_peak_Nm,
+    legs_of,
+    multisine,
     speed_and_period,
 )
 from jointctl.tools.tuning.presliding import presliding_motion
@@ -272,3 +275,105 @@ def test_an_inertia_that_the_file_has_too_large_takes_no_friction_off_a_light_jo
     size = Size(60.0, believed_kgm2, 121.0, 5.0, 1.0, 1.0)
     found, _, _ = checked(joint(size, virtual__inertia_scale=0.3 / believed_kgm2))
     assert 0.85 < found["friction"].numbers["break_away_Nm"] / size.friction_Nm < 1.2
+
+
+# --- a reducer that is soft ---
+
+
+class Soft(NamedTuple):
+    size: Size
+    motor_kgm2: float
+    stiffness_Nmprad: float
+    jumps: bool  # whether the acceleration of a motion that measures may
+
+
+SOFT = {
+    "finger": Soft(Size(1.0, 2e-3, 100.0, 0.08, 6.0, 0.8, 16), 1.5e-3, 100.0, True),
+    "wrist": Soft(Size(6.0, 0.08, 100.0, 0.8, 3.0, 1.5, 18), 0.03, 2.5e3, True),
+    "belt": Soft(Size(40.0, 1.0, 10.0, 2.0, 4.0, 1.5, 18), 0.3, 829.0, False),
+    "planetary": Soft(Size(100.0, 4.0, 25.0, 6.0, 3.0, 1.5, 18), 1.5, 1.2e4, False),
+    "series elastic": Soft(Size(40.0, 0.6, 50.0, 2.0, 4.0, 1.2, 17), 0.35, 144.0, False),
+    "base": Soft(Size(400.0, 25.0, 120.0, 50.0, 1.5, 2.0, 20), 10.0, 2e5, False),
+    "large base": Soft(Size(1000.0, 250.0, 160.0, 100.0, 0.6, 2.0, 20), 60.0, 4.5e5, False),
+}
+each_soft = pytest.mark.parametrize("one", SOFT.values(), ids=SOFT)
+
+
+def soft_joint(one: Soft, **more: Any) -> Config:
+    """With both encoders and the law of realistic.toml, with gains as they are chosen."""
+    base, size, stiffness = shipped("realistic"), one.size, one.stiffness_Nmprad
+    assert base.joint_encoder is not None
+    assert base.reducer is not None
+    rigid = joint(size)
+    link_kgm2 = size.inertia_kgm2 - one.motor_kgm2
+    critical_Nmspr = 2.0 * (stiffness * one.motor_kgm2 * link_kgm2 / size.inertia_kgm2) ** 0.5
+    reducer = base.reducer.model_copy(
+        update={
+            "motor_inertia_kgm2": one.motor_kgm2, "stiffness_Nmprad": stiffness, "loop_stiffness_Nmprad": None,
+            "knees_Nm": (), "stiffness_beyond_Nmprad": (), "damping_Nmspr": 0.04 * critical_Nmspr, "map": None,
+        }
+    )  # fmt: skip
+    second = base.joint_encoder.model_copy(
+        update={"counts_per_turn": 2**size.bits, "stiffness_Nmprad": 0.6 * stiffness}
+    )
+    return rigid.changed(
+        encoder=base.encoder, joint_encoder=second, reducer=reducer,
+        control=base.control.model_copy(update={"kp": 2400.0, "kv": 40.0}),
+        limits__following_error_max_rad=max(0.1, 1.5 * size.torque_Nm / stiffness), **more,
+    )  # fmt: skip
+
+
+def turns(times_s: np.ndarray, acceleration_radps2: np.ndarray, one: Soft) -> tuple[float, float]:
+    """(largest twist, largest change of the twist in one cycle) of the reducer under this acceleration of the link."""
+    config = soft_joint(one)
+    link_kgm2 = config.link_kgm2
+    damped = [link_kgm2, 0.04 * (one.stiffness_Nmprad * link_kgm2) ** 0.5, one.stiffness_Nmprad]
+    _, twist, _ = signal.lsim(([link_kgm2], damped), acceleration_radps2, times_s - times_s[0])
+    return float(np.max(np.abs(twist))), float(np.max(np.abs(np.diff(acceleration_radps2)))) * link_kgm2 / damped[2]
+
+
+@each_soft
+def test_a_sweep_turns_round_as_its_reducer_and_its_law_bear(one: Soft) -> None:
+    """A jump of 7 rad/s2 twists a planetary gear by a milliradian, which the law answered with 147 of its 100 Nm."""
+    config = soft_joint(one)
+    plan = sweep_plan(config, SweepOptions(quick=True, lockstep=True))
+    assert (plan.settings.rounding_s == 0.0) is one.jumps
+    table = plan.motion(plan.points, 0.0).table
+    times_s = np.arange(max(table[-1, 0] - 60.0, 0.0), table[-1, 0], 1e-3)  # the fastest plateaus
+    row = np.searchsorted(table[:, 0], times_s, side="right") - 1
+    acceleration = 2.0 * table[row, 3] + 6.0 * table[row, 4] * (times_s - table[row, 0])
+    twist_rad, jump_rad = turns(times_s, acceleration, one)
+    assert config.joint_encoder is not None
+    assert twist_rad < config.joint_encoder.disagreement_max_rad
+    control = config.control
+    answered_Nm = one.size.inertia_kgm2 * (control.kp + control.kv * velocity_of_a_step_1ps(config)) * jump_rad
+    assert answered_Nm < 0.5 * one.size.torque_Nm
+
+
+@each_soft
+def test_a_response_stays_within_what_its_encoders_may_differ(one: Soft) -> None:
+    """Triangle and multisine: at its resonance a belt twisted by more under the first, smallest excitation."""
+    config = soft_joint(one)
+    assert config.joint_encoder is not None
+    allowed_rad, rate_Hz = config.joint_encoder.disagreement_max_rad, config.loop.rate_Hz
+    legs = legs_of(config, 4)
+    velocity = legs.velocity_radps
+    twist_rad, jump_rad = turns(np.arange(len(velocity) - 1) / rate_Hz, np.diff(velocity) * rate_Hz, one)
+    assert twist_rad < 0.8 * allowed_rad
+    assert one.jumps or jump_rad < 0.05 * allowed_rad
+    length = round(speed_and_period(config)[1] * rate_Hz)
+    for start in legs.starts:
+        assert np.ptp(velocity[start : start + length]) < 1e-9
+    sine = multisine(rate_Hz, speed_and_period(config)[1])
+    torque_Nm = largest_peak_Nm(config) * np.tile(sine.wave, 3)
+    assert config.reducer is not None
+    damping, ratio = config.reducer.damping_Nmspr, 1.0 + one.motor_kgm2 / config.link_kgm2
+    twisted = ([1.0], [one.motor_kgm2, damping * ratio, one.stiffness_Nmprad * ratio])
+    _, twist, _ = signal.lsim(twisted, torque_Nm, np.arange(len(torque_Nm)) / rate_Hz)
+    assert np.max(np.abs(twist)) < 0.5 * allowed_rad
+    assert largest_peak_Nm(config) > 1e-3 * one.size.torque_Nm
+
+
+@pytest.mark.parametrize("kind", ["precise", "realistic"])
+def test_the_motions_of_the_shipped_joints_are_what_they_were(kind: str) -> None:
+    assert turning_of(shipped(kind), 1.6) == (1.6, 0.0)
