@@ -42,7 +42,9 @@ SOFT = 1.5  # residuals beyond so many deviations count less
 DAMPING_SHARE = 0.04  # of the critical damping, where a fit begins
 LOSS = 0.05  # of a spring, where a fit begins
 START_RATIOS = (0.4, 1.2, 3.5)  # link over motor
-START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0)
+START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0, 95.0, 130.0, 180.0)
+START_LOW_Hz = (2.5, 3.5, 5.0, 7.0, 10.0)  # below most lines, of which a rigid joint then fits the motor alone
+START_FRICTION_Nmspr, START_FRICTION_ps = 5.0, 6.0  # at most, and of a light joint so much over the inertia at most
 STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
@@ -291,15 +293,17 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float, motor_kgm2: float |
     or half of what is found.
     """
     parts = _used(found)
-    begin = [math.log(inertia_kgm2), math.log(0.0015), math.log(0.0005), 5.0]
+    viscous_Nmspr = min(START_FRICTION_Nmspr, START_FRICTION_ps * inertia_kgm2)
+    begin = [math.log(inertia_kgm2), math.log(0.0015), math.log(0.0005), viscous_Nmspr]
     rigid = _Model(parts, found.period_s, False, motor_kgm2)
     one = min((rigid.fitted([begin[0] + step, *begin[1:]]) for step in (-0.5, 0.5)), key=lambda fit: fit.cost)
     soft = _Model(parts, found.period_s, True, motor_kgm2)
     inertia = float(np.clip(one.x[0], -3.0 + begin[0], 3.0 + begin[0]))
     starts = [
-        [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE), LOSS]
+        [inertia + behind, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE), LOSS]
         for ratio in START_RATIOS
-        for resonance in START_RESONANCES_Hz
+        for resonances, behind in ((START_RESONANCES_Hz, 0.0), (START_LOW_Hz, math.log(1.0 + ratio)))
+        for resonance in resonances
     ]
     starts.sort(key=lambda start: float(np.sum(np.abs(soft.residuals(np.array(start))))))
     two = min((soft.fitted(start) for start in starts[:STARTS]), key=lambda fit: fit.cost)

@@ -283,6 +283,29 @@ def test_two_masses_are_found_with_intervals_from_a_wrong_guess(seed: int) -> No
     assert again.response(frequency, "link") == pytest.approx(fit.response(frequency, "link"))
 
 
+@pytest.mark.parametrize("motor", [True, False])
+@pytest.mark.parametrize("share", [0.5, 2.0])
+@pytest.mark.parametrize(
+    ("name", "joint"),
+    [
+        ("finger", TwoMasses(1.5e-3, 5e-4, 100.0, 0.015, (0.0, 0.0), (0.01, 0.0))),
+        ("stiff wrist", TwoMasses(0.02, 0.03, 1.2e4, 1.0, (0.0, 0.0), (0.3, 0.0))),
+        ("belt", TwoMasses(0.3, 0.7, 829.0, 1.1, (0.0, 0.0), (2.0, 0.0))),
+        ("series elastic", TwoMasses(0.35, 0.25, 144.0, 0.37, (0.0, 0.0), (1.5, 0.0))),
+        ("base", TwoMasses(60.0, 190.0, 4.5e5, 360.0, (0.0, 0.0), (90.0, 0.0))),
+    ],
+)
+def test_two_masses_of_any_size_are_found(name: str, joint: TwoMasses, share: float, motor: bool) -> None:
+    """From 5 to 160 Hz.  Below most lines a rigid joint fits the motor alone, and no start was near both masses."""
+    whole_kgm2 = joint.motor_kgm2 + joint.link_kgm2
+    found = made_response(joint, (1e-3, 0.5e-3))
+    fit = fit_joint(found if motor else replace(found, link=None), share * whole_kgm2)
+    assert fit.flexible
+    assert fit.resonance_Hz.value == pytest.approx(joint.resonance_Hz, rel=0.03)
+    assert fit.inertia_kgm2.value == pytest.approx(whole_kgm2, rel=0.06)
+    assert fit.link_kgm2.value == pytest.approx(joint.link_kgm2, rel=0.1)
+
+
 def test_a_resonance_whose_interval_says_little_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Friction alone may look a little like one: of a light joint at 180 +- 107 Hz."""
     response = made_response(SOFT, (1.3e-3, 0.6e-3))
