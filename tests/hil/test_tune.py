@@ -35,14 +35,22 @@ from jointctl.tools.configuration.sections import Trapezoid
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
 from jointctl.tools.session.plan import TerminalConsent
-from jointctl.tools.tuning.carry_out import ALONE, FED_STIFF, FED_STIFFEST, Carrier, TooWeak, response_by_any_law
+from jointctl.tools.tuning.carry_out import (
+    ALONE,
+    FED_STIFF,
+    FED_STIFFEST,
+    Carrier,
+    SLOW_OBSERVER_radps,
+    TooWeak,
+    response_by_any_law,
+)
 from jointctl.tools.tuning.joint_fit import fit_of
 from jointctl.tools.verbs import tune_steps
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
 from jointctl.tools.verbs.tune_report import envelope
-from jointctl.tools.verbs.tune_steps import SWEEP_OBSERVER_radps, Tune
+from jointctl.tools.verbs.tune_steps import Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.bench.tune_ensemble import scaled
 from tests.configurations import written
@@ -406,7 +414,7 @@ def test_a_tune_of_a_soft_joint_with_two_encoders_passes_the_gate_in_every_step(
     assert json.loads(out.getvalue())["friction"]["points"] > 30
     tuned = load_config(path)
     assert tuned.control.kind == "flexible_joint"
-    assert tuned.control.observer_radps > SWEEP_OBSERVER_radps  # not a slower one, which measures the friction
+    assert tuned.control.observer_radps > SLOW_OBSERVER_radps  # not a slower one, which measures the friction
     require_margin(tuned)
 
 

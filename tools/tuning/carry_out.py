@@ -20,7 +20,7 @@ from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, M
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
 from jointctl.hil.canopen.records import PowerState
-from jointctl.tools.analysis.gains import Intervals, latest_s
+from jointctl.tools.analysis.gains import BELIEVED, Intervals, latest_s
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import meets, passes
 from jointctl.tools.analysis.margins import margins
@@ -62,6 +62,7 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, fit_joint, fitted_again
 
 SLOW_OBSERVERS = 8  # that are tried, from the slowest on
+SLOW_OBSERVER_radps = 50.0  # at most, where the gate allows it, while the friction is not known: a quicker one hunts
 
 
 class TooWeak(MotionFault):
@@ -257,23 +258,27 @@ class ResponseTask:
         return ResponseMotion(self.config, plan, peak_Nm if last else self.largest_Nm)
 
 
-def response_task(config: Config, torque_Nm: float | None, legs: int, law: ResponseLaw = WEAK) -> ResponseTask:
+def response_task(config: Config, torque_Nm: float | None, legs: int, law: ResponseLaw | None = WEAK) -> ResponseTask:
     """`torque_Nm` at most, None: what fits the joint; `UsageError` where they or the limits do not fit.
 
     With that law, or with that of the configuration where the gate refuses the weak one: on a joint that is known to
-    be soft, with a light motor and a long delay.  Where it refuses the gains of the file too, with those that suit the
-    joint which the file describes.  A stiffer law is as much slower as the gate asks for.
+    be soft, with a light motor and a long delay.  Where it refuses the gains of the file too, or `law` is None, with
+    those that suit the joint which the file describes; also instead of a stiffer law on a joint that is known to be
+    soft.  On a rigid one that is as much slower as the gate asks for.
     """
     if not LEAST_LEGS <= legs <= MOST_LEGS:
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
-    if law is not WEAK:
-        law = _bearable(config, torque_Nm, law) or law
+    if law is not None and law is not WEAK:
+        law = _bearable(config, torque_Nm, law) or (law if config.reducer is None else None)
     moving, chosen = config_of_response(config, torque_Nm, law), False
     if law is WEAK and not _passes(moving):
         moving = config_of_response(config, torque_Nm, None)
-        if not _passes(moving):
-            suited = _with_chosen_gains(config)
-            moving, chosen = config_of_response(suited, torque_Nm, None), suited is not config
+    if law is None or (law is WEAK and not _passes(moving)):
+        suited = _with_chosen_gains(config)
+        chosen = suited is not config
+        if law is None:
+            suited = with_slow_observer(suited, BELIEVED, SLOW_OBSERVER_radps)
+        moving = config_of_response(suited, torque_Nm, None)
     _, length_s = speed_and_period(moving)
     sine = multisine(moving.loop.rate_Hz, length_s)
     return ResponseTask(moving, sine, legs // 2, largest_peak_Nm(moving), chosen)
@@ -358,7 +363,8 @@ def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) 
 
 ALONE, FED, FED_STIFF = "the weak law", "a part of the friction fed forward", "a stiffer law, friction fed forward"
 FED_STIFFEST = "the stiffest law, friction fed forward"
-_LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF, FED_STIFFEST: STIFFEST}
+SUITED = "gains that suit the joint of the file, friction fed forward"  # of a soft reducer, which bears none of these
+_LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF, FED_STIFFEST: STIFFEST, SUITED: None}
 _LITTLE_FRICTION, _MUCH_FRICTION = (ALONE, FED, FED_STIFF, FED_STIFFEST), (FED_STIFF, FED_STIFFEST, FED)
 MUCH_FRICTION_radps2 = 25.0  # torque to break away over the inertia that is believed
 FED_SHARE = 0.7  # of the torque that began to move the joint: less than what it slides under
@@ -367,8 +373,11 @@ SLOWER = (1.0, 0.8, 0.65, 0.5)  # times the bandwidth of a stiffer law: of a joi
 
 
 def _bearable(config: Config, torque_Nm: float | None, law: ResponseLaw, heavier: float = 1.0) -> ResponseLaw | None:
-    """That law, or a slower one that the gate bears with gains for so many times the inertia; None: none of them."""
-    for share in SLOWER:
+    """That law, or a slower one that the gate bears with gains for so many times the inertia; None: none of them.
+
+    Of a joint whose reducer is known to be soft no slower one: there are gains that suit it.
+    """
+    for share in SLOWER if config.reducer is None else SLOWER[:1]:
         kp_ps2, kv_ps = share**2 * law.kp_ps2, share * law.kv_ps
         slower = law._replace(kp_ps2=kp_ps2, kv_ps=kv_ps, observer_radps=share * law.observer_radps)
         judged = slower._replace(kp_ps2=heavier * kp_ps2, kv_ps=heavier * kv_ps)
@@ -400,6 +409,8 @@ def response_by_any_law(
         FED_STIFF: _bearable(before, torque_Nm, STIFF), FED_STIFFEST: _bearable(before, torque_Nm, STIFFEST, HEAVIER),
     }  # fmt: skip
     laws = [law for law in laws if stiffer.get(law, WEAK) is not None]
+    if before.reducer is not None and static_Nm > 0.0 and FED_STIFF not in laws:
+        laws.append(SUITED)
 
     def by(law: str, *others: str) -> tuple[str, ResponseTask, tuple[FrequencyResponse, Any, ResponsePlan]]:
         believed = _with_inertia(before, HEAVIER * before.joint.inertia_kgm2) if law == FED_STIFFEST else before
@@ -410,11 +421,12 @@ def response_by_any_law(
         if task.chosen:
             control = task.config.control
             gains = f"kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s"
-            carrier.output.note(f"  the gate refuses the gains of the file; for the response: {gains}")
+            why = "" if law == SUITED else "the gate refuses the gains of the file; "
+            carrier.output.note(f"  {why}for the response: {gains}")
         try:
             return law, task, measured_response(task, carrier)
         except TooWeak as error:
-            if not others:
+            if not others or (others[0] == SUITED and not _passes(task_by(SUITED, before, legs, torque_Nm).config)):
                 raise
             carrier.output.note(f"  {error.message}: once more, {others[0]}")
         except TooStiff as error:

@@ -66,6 +66,7 @@ from jointctl.tools.tuning.carry_out import (
     SWEEP_SHARE,
     Carrier,
     NotCarriedOut,
+    SLOW_OBSERVER_radps,
     TooWeak,
     VerifyingMotion,
     require_one_joint,
@@ -105,7 +106,6 @@ SOFTER = ("the step pulls with a law of its own, as stiff as the static friction
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
 SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the next where the slow ones swing
-SWEEP_OBSERVER_radps = 50.0  # at most, where the gate allows it
 VERIFY_FROM_s = 5.0
 WORSE = 1.5  # times the error with the gains as they were
 REFINE_RUNS = 4
@@ -269,7 +269,7 @@ class Tune:
         config, fit = self._before_friction(), self.fit
         if fit is None:
             return config
-        config = with_slow_observer(config, fit.intervals(), SWEEP_OBSERVER_radps)
+        config = with_slow_observer(config, fit.intervals(), SLOW_OBSERVER_radps)
         static_Nm, kept = static_friction_Nm(config), self.state["response"]["gravity"]
         if static_Nm is None or "sliding_Nm" not in kept:
             return config

@@ -27,12 +27,15 @@ from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.tuning import carry_out, joint_fit
 from jointctl.tools.tuning.carry_out import (
+    FED_STIFF,
+    SUITED,
     Carried,
     HUNTING_Hz,
     TooWeak,
     measured_response,
     response_by_any_law,
     response_task,
+    task_by,
 )
 from jointctl.tools.tuning.frequency_response import (
     GOOD_COHERENCE,
@@ -557,6 +560,32 @@ def test_a_light_joint_that_swings_fast_and_then_stands_gets_the_stiffest_law(st
     with pytest.raises(MotionFault, match="LIMIT_CYCLE"):
         response_by_any_law(with_break_away(shipped("precise", joint__inertia_kgm2=0.5), 20.0), 8, carrier, 55.0)
     assert laws == [1600.0, 100.0, 3200.0][: 3 if stands else 2]
+
+
+def test_a_light_soft_joint_gets_gains_that_suit_its_file() -> None:
+    """The gate refuses the stiffer laws; the weak one with friction fed forward swung, and nothing followed it."""
+    laws: list[tuple[float, str]] = []
+
+    def run(config: Any, *_: Any, **__: Any) -> Carried:
+        laws.append((config.control.kp, config.control.feed_forward))
+        assert passes(config)
+        log = new(LogRecord, 100)
+        log.phase = AxisPhase.TRACKING
+        return Carried(log, Fault.FOLLOWING_ERROR, FaultText("happened", "cause", "next"), "", 0.1)
+
+    notes: list[str] = []
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=notes.append))
+    light = shipped(
+        "realistic", joint__inertia_kgm2=0.21, reducer__motor_inertia_kgm2=0.095, reducer__damping_Nmspr=2.5
+    )
+    with pytest.raises(TooWeak):
+        response_by_any_law(with_break_away(light, 10.0), 8, carrier)
+    assert [feed for _, feed in laws] == ["desired", "desired"]
+    assert laws[0][0] == 100.0
+    assert laws[1][0] > 300.0  # that of the file
+    assert f"  law: {SUITED}" in notes
+    # and the same for the question whether it is still this joint, whichever law moved it
+    assert passes(task_by(FED_STIFF, with_break_away(light, 10.0), 8).config)
 
 
 @pytest.mark.parametrize(("name", "kps"), [("precise", [100.0, 1600.0, 3200.0]), ("realistic", [100.0])])
