@@ -56,7 +56,9 @@ PERIOD_s, SHORT_PERIOD_s = 4.0, 2.0
 SETTLE_s = 0.6  # of a leg, before its period
 FADE_s = 0.5
 LINES = 80
-LOWEST_Hz, HIGHEST_SHARE = 1.0, 0.25  # of loop.rate_Hz
+LOWEST_Hz = 1.0
+# of loop.rate_Hz, the highest line; of a slow loop more, up to 250 Hz: a resonance beyond it is not seen
+HIGHEST_SHARE, MOST_SHARE, SEEN_Hz = 0.25, 0.4, 250.0
 LEAST_BINS = 2  # between two lines: the window of the analysis is that wide
 FULL_FROM_Hz = 3.0  # lines below are smaller: they would turn the motion round
 CRESTS = 200  # random phases that are tried for a low peak
@@ -95,9 +97,9 @@ class Multisine:
 
 @functools.lru_cache(maxsize=4)
 def multisine(rate_Hz: float, length_s: float) -> Multisine:
-    """Lines from LOWEST_Hz to a quarter of the rate, even steps of the logarithm, phases with a low peak."""
+    """Lines from LOWEST_Hz to a share of the rate, even steps of the logarithm, phases with a low peak."""
     samples = round(rate_Hz * length_s)
-    highest = HIGHEST_SHARE * rate_Hz
+    highest = max(HIGHEST_SHARE * rate_Hz, min(MOST_SHARE * rate_Hz, SEEN_Hz))
     wanted = np.geomspace(LOWEST_Hz, highest, LINES) * length_s
     bins = [max(round(wanted[0]), LEAST_BINS)]
     for bin_wanted in wanted[1:]:

@@ -49,6 +49,8 @@ STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
 KNOWN_RESONANCE = 0.4  # half width of its interval over it, at most: a wider one is friction's, or none
+# the same of one beyond the highest line, and how far: its flank is seen, and a law for a rigid joint would feed it
+KNOWN_BEYOND, BEYOND = 0.2, 1.6
 USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
 SHARE_SPREAD = 0.7  # of the motor's logarithm, or of link over motor: the link alone shows their sum and the resonance
 LATEST_s = 0.012  # of delay and of lag, at most
@@ -309,8 +311,10 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float, motor_kgm2: float |
     two = min((soft.fitted(start) for start in starts[:STARTS]), key=lambda fit: fit.cost)
     better = rigid.criterion(one) - soft.criterion(two)
     highest = max(float(part.frequency_Hz[-1]) for part in parts)
-    values, flexible = _intervals(soft, two), better > BETTER and soft.joint(two.x).resonance_Hz < highest
-    flexible = flexible and values["resonance_Hz"].half <= KNOWN_RESONANCE * values["resonance_Hz"].value
+    values, resonance_Hz = _intervals(soft, two), soft.joint(two.x).resonance_Hz
+    beyond = resonance_Hz >= highest
+    known = values["resonance_Hz"].half <= (KNOWN_BEYOND if beyond else KNOWN_RESONANCE) * resonance_Hz
+    flexible = better > BETTER and known and resonance_Hz < BEYOND * highest
     model, best = (soft, two) if flexible else (rigid, one)
     values = values if flexible else _intervals(rigid, one)
     relative = [part.sigma for part in parts]
