@@ -23,7 +23,7 @@ from jointctl.drivers.errors import UsageError
 from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.analysis.margin_gate import OVERLOADED
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import free_torque_Nm, friction_constants
+from jointctl.tools.configuration.conversions import free_torque_Nm, friction_constants, turning_of
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
 from jointctl.tools.identification.models import EXPERIMENTS, FORMS, SIGNS, Model, Samples, jacobian
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
@@ -37,6 +37,7 @@ from jointctl.tools.sweeping.plan import (
     SweepMotion,
     fastest_allowed_radps,
     position_margin_rad,
+    ramps_rad,
     require_torque,
     shifted,
 )
@@ -120,8 +121,9 @@ def designed(config: Config, duration_s: float, seed: int) -> Design:
     margin_rad = position_margin_rad(config)
     width_rad = limits.position_max_rad - limits.position_min_rad - 2.0 * margin_rad
     fastest = fastest_allowed_radps(config)
+    acceleration_radps2, rounding_s = turning_of(config, ACCELERATION_SHARE * config.sequence.brake_radps2)
     settings = PlanSettings(
-        width_rad, ACCELERATION_SHARE * config.sequence.brake_radps2, fastest, 1.0, 0.0, config.joint.reduction_ratio
+        width_rad, acceleration_radps2, fastest, 1.0, 0.0, config.joint.reduction_ratio, rounding_s=rounding_s
     )
     model, vector = believed(config)
     middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
@@ -162,12 +164,12 @@ def _candidate(s: PlanSettings, slowest_radps: float, duration_s: float, random:
     builder = MotionBuilder(s)
     half = 0.5 * s.width_rad
     until_s = duration_s * random.uniform(*STROKES_SHARE)
-    fastest = min(s.transit_radps, math.sqrt(0.5 * s.acceleration_radps2 * s.width_rad))
+    fastest = min(s.transit_radps, builder.peak_radps(half, 0.0))
     count = int(random.integers(4, 9))
     speeds = np.geomspace(slowest_radps, fastest, count)
     while builder.t_s < until_s:
         for number, speed in enumerate(random.permutation(speeds)):
-            ramps = speed * speed / s.acceleration_radps2
+            ramps = ramps_rad(speed, s)
             length = min(s.width_rad - ramps, speed * STROKE_S)
             reach = half - 0.5 * (length + ramps)
             place = reach * ((number % PLACES) - 1) * random.uniform(0.5, 1.0)

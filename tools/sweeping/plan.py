@@ -123,8 +123,10 @@ def _ramp_s(change_radps: float, s: PlanSettings) -> float:
     return max(change_radps / s.acceleration_radps2, s.rounding_s) + s.rounding_s if change_radps else 0.0
 
 
-def _ramps_rad(speed_radps: float, s: PlanSettings, slow_radps: float = 0.0) -> float:
+def ramps_rad(speed_radps: float, s: PlanSettings, slow_radps: float = 0.0) -> float:
     """Distance of speeding up from `slow_radps` and of braking to it."""
+    if s.rounding_s == 0.0:
+        return (speed_radps * speed_radps - slow_radps * slow_radps) / s.acceleration_radps2
     return (speed_radps + slow_radps) * _ramp_s(speed_radps - slow_radps, s)
 
 
@@ -133,7 +135,7 @@ ROUNDING = 1e-6  # the highest speed must fit in spite of rounding
 
 def room_rad(speed_radps: float, s: PlanSettings) -> float:
     """Longest window that fits into the travel at this speed; negative if not even the ramps fit."""
-    return s.width_rad - _ramps_rad(speed_radps, s) - _lead_rad(speed_radps, s)
+    return s.width_rad - ramps_rad(speed_radps, s) - _lead_rad(speed_radps, s)
 
 
 def fastest_radps(s: PlanSettings) -> float:
@@ -167,7 +169,7 @@ def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
     hop = joint / TEETH - tooth - _lead_rad(speed_radps, s)
     if wanted * PATIENCE < joint and hop > 0.0 and room >= joint:
         pitch = joint / TEETH
-        length = _ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + (TEETH - 1) * pitch + tooth
+        length = ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + (TEETH - 1) * pitch + tooth
         return Stroke(speed_radps, tooth, TEETH, 1, pitch, length)
     if room >= joint:
         periods = max(1, round(wanted / joint))
@@ -177,7 +179,7 @@ def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
         periods = max(1, round(wanted / motor))
         window = min(periods, math.floor(room / motor)) * motor
         strokes = math.ceil(periods * motor / window - 1e-9)
-    length = _ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + window
+    length = ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + window
     return Stroke(speed_radps, window, 1, min(strokes, MOST_STROKES), window, length)
 
 
@@ -220,11 +222,11 @@ class MotionBuilder:
         self._row(distance_rad / abs(self.v_radps), 0.0)
         return start_s, self.t_s
 
-    def _peak_radps(self, distance_rad: float, slow: float) -> float:
+    def peak_radps(self, distance_rad: float, slow: float) -> float:
         """Whose ramps from and to the speed `slow` take the distance; no less than `slow`."""
         a, rounding_s = self._s.acceleration_radps2, self._s.rounding_s
         half = 0.5 * a * rounding_s
-        peak = math.sqrt(max((slow - half) ** 2 + a * distance_rad, 0.0)) - half
+        peak = math.sqrt((slow - half) * (slow - half) + a * distance_rad) - half
         if peak - slow < a * rounding_s:
             peak = 0.5 * distance_rad / rounding_s - slow
         return max(peak, slow)
@@ -235,8 +237,8 @@ class MotionBuilder:
     def hop(self, distance_rad: float) -> None:
         """Quickly over a distance > 0 in the direction of motion, at the present speed again at its end."""
         slow = self.v_radps
-        peak = min(self._peak_radps(distance_rad, abs(slow)), max(self._s.transit_radps, abs(slow)))
-        ramps = _ramps_rad(peak, self._s, abs(slow))
+        peak = min(self.peak_radps(distance_rad, abs(slow)), max(self._s.transit_radps, abs(slow)))
+        ramps = ramps_rad(peak, self._s, abs(slow))
         self.ramp(math.copysign(peak, slow))
         if distance_rad > ramps:
             self.cruise(distance_rad - ramps)
@@ -246,8 +248,8 @@ class MotionBuilder:
         """From rest to rest."""
         distance = target_rad - self.q_rad
         if abs(distance) > 1e-12:
-            peak = min(self._peak_radps(abs(distance), 0.0), self._s.transit_radps)
-            ramps = _ramps_rad(peak, self._s)
+            peak = min(self.peak_radps(abs(distance), 0.0), self._s.transit_radps)
+            ramps = ramps_rad(peak, self._s)
             self.ramp(math.copysign(peak, distance))
             if abs(distance) > ramps:
                 self.cruise(abs(distance) - ramps)
