@@ -23,6 +23,7 @@ from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_p
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm
+from jointctl.drivers.canopen.watchdog import QUICK_STOP_RAMPS, needed_braking
 from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import CommandKind
@@ -39,6 +40,7 @@ from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import (
     CanopenSection,
     canopen_section,
+    canopen_settings,
     eds_path,
     encoder_eds_path,
     torque_limit_object,
@@ -173,9 +175,29 @@ def device_settings(config: Config) -> DeviceSettings:
         product_code=drive.product_code or product_code or 1,
         torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
+        quick_stop=_quick_stop(drive, config),
         **_second_encoder(config),
         **_drive_loops(drive, config),
     )
+
+
+USUAL_RAMPS_radps2 = {0x6084: 4.8, 0x6085: 12.0}  # at the joint, by the EDS
+
+
+def _quick_stop(drive: CanopenSection, config: Config) -> tuple[int, float] | None:
+    """The ramp of its quick stop (object, rad/s2 at the joint), where that of the EDS does not suit the joint.
+
+    A real drive's is set to its joint: no faster than the torque can brake it, and no slower than its limits need; a
+    drive that closes its own loop has the loop's own stop for a measure too.
+    """
+    index = QUICK_STOP_RAMPS.get(drive.quick_stop_option, 0)
+    if not index:
+        return None
+    of_loop, *of_limits = (radps2 for radps2, _ in needed_braking(canopen_settings(config)))
+    most = (config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)) / config.joint.inertia_kgm2
+    usual = USUAL_RAMPS_radps2[index]
+    wanted = max(min(usual, most), *of_limits, 0.0 if drive.cascade is None else of_loop)
+    return None if wanted == usual else (index, wanted)
 
 
 SUITED_FRICTION_radps2 = 15.0  # static friction over the inertia, up to which a gain for the inertia overcomes it

@@ -88,8 +88,26 @@ _OWN_UNITS = {0xFB: "maxon", 0xAB: "Copley"}  # makers whose accelerations are i
 _UNITS = {0x60AA: (0, 0xB55700), 0x60A9: (0, 0xB50300), 0x60A8: (0, 0xB50000), 0x608E: (0,), 0x608D: (0,)}
 _FACTORS = (0x6091, 0x6093, 0x6094, 0x6095, 0x6096, 0x6097)  # numerator and divisor: gear ratio, factors
 _MAKER = 0x1018, 1
+_LARGEST = 0xFFFFFFFF  # of 6084 and 6085
 _SAME = 1e-3  # by so much a ramp may be slower and is not reported: rounding
 Read = Callable[[int, int], int | None]  # an unsigned object; None where the drive does not give it
+
+
+def needed_braking(settings: CanopenSettings) -> list[tuple[float, str]]:
+    """How fast the drive must brake by itself [rad/s2 at the joint], each with what a slower one would be, in words.
+
+    The first is that of the loop's own stop, the others those of the limits.
+    """
+    speed, brake = settings.velocity_max_radps or 0.0, settings.brake_radps2
+    room = settings.position_max_rad - settings.position_min_rad
+    needs = [
+        (brake, f"slower than sequence.brake_radps2 (={brake:g})"),
+        (0.5 * speed**2 / room, f"farther than between the position limits ({room:g} rad)"),
+    ]
+    if settings.stop_timeout_s:
+        longest = f"longer than sequence.stop_timeout_s (={settings.stop_timeout_s:g})"
+        needs.append((speed / settings.stop_timeout_s, longest))
+    return needs
 
 
 @dataclass(frozen=True)
@@ -103,25 +121,22 @@ class QuickStop:
 
     def problem(self, settings: CanopenSettings) -> str:
         """One line where it brakes slower than the loop's own stop, or than the limits need; "" else."""
-        speed, brake = settings.velocity_max_radps, settings.brake_radps2
+        speed = settings.velocity_max_radps
         if self.radps2 is None or not speed:
             return ""
         seconds, way = speed / self.radps2, 0.5 * speed**2 / self.radps2
-        room = settings.position_max_rad - settings.position_min_rad
-        needs = [
-            (brake, f"slower than sequence.brake_radps2 (={brake:g})"),
-            (0.5 * speed**2 / room, f"farther than between the position limits ({room:g} rad)"),
-        ]
-        if settings.stop_timeout_s:
-            longest = f"longer than sequence.stop_timeout_s (={settings.stop_timeout_s:g})"
-            needs.append((speed / settings.stop_timeout_s, longest))
+        needs = needed_braking(settings)
         missed = [(radps2, words) for radps2, words in needs if self.radps2 < radps2 * (1.0 - _SAME)]
         if not missed:
             return ""
-        least = math.ceil(max(radps2 for radps2, _ in missed) / self.rad_per_count)
+        wanted = max(radps2 for radps2, _ in missed)
+        least = math.ceil(wanted / self.rad_per_count)
+        remedy = f"{self.index:04X} should be {least} or more"
+        if least > _LARGEST:
+            remedy = f"{wanted:.3g} rad/s2 is more than {self.index:04X} holds in counts of this encoder"
         return (
             f"{self.words}, {seconds:.2g} s and {way:.2g} rad from limits.velocity_max_radps (={speed:g}): "
-            f"{', '.join(words for _, words in missed)}; {self.index:04X} should be {least} or more"
+            f"{', '.join(words for _, words in missed)}; {remedy}"
         )
 
 

@@ -49,6 +49,7 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
+    quick_stop: tuple[int, float] | None = None  # the object with its ramp, and that at the joint [rad/s2]; None = EDS
     torque_limit: tuple[int, int, float] | None = None  # the maker's own: index, sub, what it holds at rated torque
     shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
 
@@ -162,6 +163,8 @@ class Cia402Device:
         objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
         objects.set_default(0x6075, 0, settings.rated_current_mA)
         objects.set_default(0x6076, 0, round(settings.rated_torque_mNm / settings.rated_torque_unit_mNm))
+        if settings.quick_stop is not None:
+            objects.set_ramp(*settings.quick_stop, abs(device.counts_per_rad))
         if settings.torque_limit is not None and objects.limit_torque_by(*settings.torque_limit):
             device.makers_limit_rated_counts = settings.torque_limit[2]
         identity = (settings.vendor_id, settings.product_code, settings.revision, settings.serial_number)

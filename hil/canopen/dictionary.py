@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -127,6 +128,7 @@ def _foreign_entry(variable: ODVariable, own: Entry | None) -> Entry:
     """An object of another drive's EDS.  Where that leaves the default open, `own` has it.
 
     Many files give 0 as the default of everything: for a drive object (6000h and above) it counts as left open.
+    Speeds and ramps are in counts of an encoder that no file knows: they are `own`, which suit the joint.
     Limits below 2000h are the standard's: files have them wrong (1016:1 up to 65535, without the node).
     """
     entry = _entry(variable)
@@ -136,6 +138,7 @@ def _foreign_entry(variable: ODVariable, own: Entry | None) -> Entry:
         size = _BYTES.get(variable.data_type or 0)
         return replace(entry, default=str(entry.default) if size is None else "\0" * size)
     left_open = variable.default is None or (entry.default == 0 and entry.index >= 0x6000)
+    left_open = left_open or (variable.index, variable.subindex) in _IN_COUNTS
     if left_open and own is not None and own.dtype is not None:
         return replace(entry, default=own.default)
     return entry
@@ -281,6 +284,12 @@ class ObjectDictionary:
             self._initial[index, sub][0] = value
         else:
             self._default_strings[index, sub] = np.array(value, self.entries[index, sub].dtype).tobytes()
+
+    def set_ramp(self, index: int, radps2: float, counts_prad: float) -> None:
+        """`set_default` of a ramp in counts per s2, rounded up, as far as a number there holds it."""
+        if (index, 0) in self._initial:
+            most = int(np.iinfo(self._initial[index, 0].dtype).max)
+            self.set_default(index, 0, min(max(math.ceil(radps2 * counts_prad), 1), most))
 
     def default(self, index: int, sub: int) -> int | bytes:
         initial = self._initial.get((index, sub))
