@@ -73,8 +73,8 @@ def joint(size: Size, base: str = "precise", **more: Any) -> Config:
 
 
 def own_loop_joint(size: Size, mode: str, cascade: dict[str, Any] | None = None, **more: Any) -> Config:
-    """The same with a drive in CSP or CSV, whose gains go with the inertia, at rates down to 100 Hz."""
-    gain = 95.0 * size.inertia_kgm2
+    """The same with a drive in CSP or CSV, whose gains go with inertia and friction, at rates down to 100 Hz."""
+    gain = 95.0 * size.inertia_kgm2 * max(size.friction_Nm / size.inertia_kgm2 / 60.0, 1.0)
     gains: dict[str, Any] = {
         "velocity_gain_Nmspr": gain, "velocity_integral_Nmprad": 50.0 * gain,
         "position_gain_ps": min(30.0, size.rate_Hz / 25.0),

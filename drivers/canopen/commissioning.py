@@ -18,21 +18,26 @@ from jointctl.drivers.canopen.pdo import (
     TARGET_POSITION,
     TARGET_TORQUE,
     TARGET_VELOCITY,
+    Misfit,
     PdoLayout,
     RATED_TORQUE_UNITS_mNm,
+    coarse_numbers,
     configure_loop_pdos,
     joint_angle_per_count_rad,
     joint_torque_per_permille_Nm,
     joint_velocity_per_unit_radps,
     listen_to_our_sync,
     map_velocity_offset,
+    position_misfit,
+    torque_misfit,
+    velocity_misfit,
 )
 from jointctl.drivers.canopen.sdo import ObjectAccess, object_name
 from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
 from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline, quick_stop_of
 from jointctl.drivers.drive import DriveIdentity
-from jointctl.drivers.errors import DeviceError, text_Nm
+from jointctl.drivers.errors import DeviceError, text_Nm, text_radps
 from jointctl.firmware_py.states import in_words
 
 CIA402_PROFILE = 402
@@ -212,8 +217,14 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
     findings.settings["mode"] = findings.mode.name.lower()
 
 
+def _refuse(misfit: Misfit) -> None:
+    if misfit is not None:
+        raise DeviceError(*misfit)
+
+
 def take_place(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """In CSP: the target is where the joint stands, before anything could enable; the drive's own following window."""
+    _refuse(position_misfit(settings))
     here = objects.read(0x6064, what="position actual value")
     objects.write_verified(0x607A, 0, here, what="target position")
     window = math.ceil(settings.following_error_max_rad / joint_angle_per_count_rad(settings))
@@ -292,13 +303,14 @@ def require_own_loop(objects: ObjectAccess, settings: CanopenSettings, findings:
 
 def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """With a loop of its own: no stale target, the drive's own limit 607F, ramps that leave the loop's in charge."""
+    _refuse(velocity_misfit(settings))
     if findings.mode in VELOCITY_MODES:
         objects.write_verified(0x60FF, 0, 0, what="target velocity")
     unit_radps = joint_velocity_per_unit_radps(settings)
     if settings.velocity_max_radps is not None and objects.has(0x607F):
         highest = min(math.ceil(settings.velocity_max_radps / unit_radps), LARGEST_UNSIGNED)
         objects.write_verified(0x607F, 0, highest, what="max profile velocity")
-        findings.settings["max velocity"] = f"{highest} {settings.velocity_unit} = {highest * unit_radps:.2f} rad/s"
+        findings.settings["max velocity"] = f"{highest} {settings.velocity_unit} = {text_radps(highest * unit_radps)}"
     if findings.mode is Mode.PROFILE_VELOCITY:
         steep = min(round(STEEP_RADPS2 / unit_radps), LARGEST_UNSIGNED)
         objects.write_verified(0x6083, 0, steep, what="profile acceleration")
@@ -419,6 +431,8 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
             f"drive.max_torque_permille (={permille}) allows by the drive's own rated value: the loop would not notice "
             "that its torque is cut"
         )
+    _refuse(torque_misfit(settings, permille, scale))
+    findings.remarks += coarse_numbers(settings, scale)
     findings.max_permille = min(permille, LARGEST_PERMILLE)
     if findings.max_permille < permille:
         findings.remarks.append(f"6072 holds at most {LARGEST_PERMILLE} permille: torque is limited to that")

@@ -392,6 +392,91 @@ def joint_velocity_per_unit_radps(settings: CanopenSettings) -> float:
     return motor_radps / settings.reduction_ratio
 
 
+# --- whether the whole numbers of the drive suit the joint: each (what is wrong, remedy), or None ---
+
+
+LARGEST_SIGNED = 0x7FFFFFFF  # of 607A, 60FF and 60B1
+LEAST_UNITS = 10.0  # of 60FF in the velocity limit: 607F, rounded up, is a tenth more at most
+MOST_WIDER = 1.1  # over limits.torque_max_Nm, of a limit of the drive that holds alone
+FINE_UNITS = 100.0  # in a limit; with fewer, that numbers are coarse is reported
+Misfit = tuple[str, str] | None
+
+
+def sends_velocity(settings: CanopenSettings) -> bool:
+    """Whether 60FF or 60B1 is part of a cycle."""
+    return settings.mode in ("csv", "pv", "velocity or torque") or (settings.mode == "csp" and settings.velocity_offset)
+
+
+def velocity_misfit(settings: CanopenSettings) -> Misfit:
+    """Of the velocity limit and the unit of 60FF, 60B1 and 607F."""
+    speed, unit_radps = settings.velocity_max_radps, joint_velocity_per_unit_radps(settings)
+    if speed is None or not sends_velocity(settings) or LEAST_UNITS * unit_radps <= speed < LARGEST_SIGNED * unit_radps:
+        return None
+    remedy = "a unit of the drive that suits the joint (drive.velocity_unit), or a mode that sends no velocity"
+    start = f"limits.velocity_max_radps (={speed:g}) must be"
+    if speed < LEAST_UNITS * unit_radps:
+        return (
+            f"{start} at least {LEAST_UNITS * unit_radps:.3g}, ten units of 60FF (drive.velocity_unit = "
+            f"{settings.velocity_unit}, at the joint {unit_radps:.3g} rad/s): the speed would be rounded away",
+            remedy,
+        )
+    return (
+        f"{start} less than {LARGEST_SIGNED * unit_radps:.3g}, what the 32 bit of 60FF and 60B1 hold in "
+        f"{settings.velocity_unit}",
+        remedy,
+    )
+
+
+def position_misfit(settings: CanopenSettings) -> Misfit:
+    """Of the position limits and the 32 bit of 607A in CSP: beyond them the target would jump by their whole range."""
+    if settings.mode != "csp":
+        return None
+    ends_rad, count_rad = (settings.position_min_rad, settings.position_max_rad), joint_angle_per_count_rad(settings)
+    ends = [settings.zero_counts + settings.encoder_direction * rad / count_rad for rad in ends_rad]
+    if max(map(abs, ends)) < LARGEST_SIGNED:
+        return None
+    return (
+        f"limits.position_min_rad (={ends_rad[0]:g}) and position_max_rad (={ends_rad[1]:g}) are {min(ends):.4g} to "
+        f"{max(ends):.4g} counts of 607A, which holds 32 bit with a sign",
+        "narrower limits, another encoder.zero_counts, positions scaled in the drive (6091, 6092), or "
+        'drive.mode = "csv"',
+    )
+
+
+def torque_misfit(settings: CanopenSettings, permille: int, permille_Nm: float) -> Misfit:
+    """Of 6072 and the torque limit, where the drive closes its own loop and 6072 alone limits its torque."""
+    limit_Nm, widest_Nm = settings.torque_max_Nm, permille * permille_Nm
+    if not settings.holds_alone or settings.torque_limit is not None or widest_Nm <= MOST_WIDER * limit_Nm:
+        return None
+    start = f"limits.torque_max_Nm (={limit_Nm:g}): in mode {settings.mode} the drive alone limits its torque, to"
+    if settings.max_torque_permille is not None:
+        return (
+            f"{start} {widest_Nm:.3g} Nm by drive.max_torque_permille (={permille})",
+            "leave drive.max_torque_permille out: it follows from limits.torque_max_Nm",
+        )
+    return (
+        f"{start} {widest_Nm:.3g} Nm, since 6072 counts in {permille_Nm:.3g} Nm",
+        "a drive, or a rated torque in it (6076), that suits the joint; or its maker's own limit: "
+        "drive.torque_limit_object",
+    )
+
+
+def coarse_numbers(settings: CanopenSettings, permille_Nm: float) -> list[str]:
+    """One line for each of the drive's numbers that is coarse for the joint's limits."""
+    found, unit_radps, speed = [], joint_velocity_per_unit_radps(settings), settings.velocity_max_radps
+    if FINE_UNITS * permille_Nm > settings.torque_max_Nm * (1.0 + 1e-9):
+        found.append(
+            f"the drive counts torque in {permille_Nm:.3g} Nm (thousandths of its rated torque), "
+            f"{permille_Nm / settings.torque_max_Nm:.0%} of limits.torque_max_Nm (={settings.torque_max_Nm:g})"
+        )
+    if speed is not None and sends_velocity(settings) and FINE_UNITS * unit_radps > speed * (1.0 + 1e-9):
+        found.append(
+            f"the drive counts velocity in {unit_radps:.3g} rad/s (drive.velocity_unit = {settings.velocity_unit}), "
+            f"{unit_radps / speed:.0%} of limits.velocity_max_radps (={speed:g})"
+        )
+    return found
+
+
 def new_port(
     settings: CanopenSettings,
     torque_per_permille_Nm: float,

@@ -12,7 +12,7 @@ import numpy as np
 from jointctl.drivers.errors import text_Nm
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
-from jointctl.tools.analysis.margin_gate import coarsest
+from jointctl.tools.analysis.margin_gate import cascade_of, coarsest
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import (
     law_resolution_rad,
@@ -94,6 +94,7 @@ MOST_RATED, LEAST_RATED = 10.0, 0.02  # of the motor's rated current, that the t
 MOST_A, LEAST_A = 300.0, 0.02  # where no rated current is configured
 FRICTION_ERROR = 0.1  # share by which friction is often wrong
 BEGINS_S = 0.1  # in which a motion begins
+LEAST_STEPS = 2.0  # counts of an encoder in a swing that is not of its own making
 
 
 def contradictions(config: Config) -> list[str]:
@@ -101,6 +102,7 @@ def contradictions(config: Config) -> list[str]:
     return [
         *rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config),
         *_standstill_contradiction(config), *_friction_contradiction(config), *_stiffness_contradiction(config),
+        *_swing_contradiction(config), *config.drive.coarse_numbers(config),
     ]  # fmt: skip
 
 
@@ -172,9 +174,12 @@ def _standstill_contradiction(config: Config) -> list[str]:
 def _friction_contradiction(config: Config) -> list[str]:
     """Friction that is a little more than believed, against what the law pushes with where the joint stays behind."""
     control, static_Nm = config.control, static_friction_Nm(config)
-    if static_Nm is None or control.feed_forward == "none" or config.drive.own_loop() is not CommandKind.TORQUE:
+    behind_rad = FROZEN_SHARE * config.limits.following_error_max_rad
+    if static_Nm is not None and config.drive.own_loop() is not CommandKind.TORQUE:
+        return _soft_cascade(config, static_Nm, behind_rad)
+    if static_Nm is None or control.feed_forward == "none":
         return []
-    wrong_Nm, behind_rad = FRICTION_ERROR * static_Nm, FROZEN_SHARE * config.limits.following_error_max_rad
+    wrong_Nm = FRICTION_ERROR * static_Nm
     pushes_Nm = config.joint.inertia_kgm2 * control.kp * behind_rad * (1.0 + control.observer_radps * BEGINS_S)
     if pushes_Nm >= wrong_Nm:
         return []
@@ -185,6 +190,23 @@ def _friction_contradiction(config: Config) -> list[str]:
     ]
 
 
+def _soft_cascade(config: Config, static_Nm: float, behind_rad: float) -> list[str]:
+    """The same of a drive's own loop: where friction reverses, its integral still holds the torque of before."""
+    cascade = cascade_of(config)
+    gain, integral = cascade.velocity_gain_Nmspr, cascade.velocity_integral_Nmprad
+    if gain is None or integral is None or cascade.position_gain_ps is None:
+        return []
+    pushes_Nm = cascade.position_gain_ps * behind_rad * (gain + integral * BEGINS_S)
+    if pushes_Nm >= static_Nm:
+        return []
+    return [
+        f"drive.cascade: position_gain_ps (={cascade.position_gain_ps:g}), velocity_gain_Nmspr (={gain:g}) and "
+        f"velocity_integral_Nmprad (={integral:g}) push a joint that is {behind_rad:g} rad behind with "
+        f"{pushes_Nm:.3g} Nm, less than [friction] at rest ({static_Nm:.3g} Nm): it may stick (POSITION_FROZEN) or "
+        "slip back and forth (LIMIT_CYCLE)"
+    ]
+
+
 def _stiffness_contradiction(config: Config) -> list[str]:
     reducer = config.reducer
     if reducer is None or (reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad) >= reducer.stiffness_Nmprad:
@@ -192,6 +214,21 @@ def _stiffness_contradiction(config: Config) -> list[str]:
     return [
         f"reducer.loop_stiffness_Nmprad (={reducer.loop_stiffness_Nmprad:g}) is less than reducer.stiffness_Nmprad "
         f"(={reducer.stiffness_Nmprad:g}): hysteresis makes a small motion stiffer, not softer"
+    ]
+
+
+def _swing_contradiction(config: Config) -> list[str]:
+    """The swing of the error that is a fault, against the steps in which an encoder reads a joint that moves slowly."""
+    limits, step_rad = config.limits, law_resolution_rad(config)
+    swing_rad = limits.swing_error_share * limits.following_error_max_rad
+    if swing_rad >= LEAST_STEPS * step_rad:
+        return []
+    share = math.ceil(100.0 * LEAST_STEPS * step_rad / limits.following_error_max_rad) / 100.0
+    return [
+        f"limits.swing_error_share (={limits.swing_error_share:g}) of following_error_max_rad "
+        f"(={limits.following_error_max_rad:g}) is {1e3 * swing_rad:.3g} mrad, and a count of the encoder "
+        f"{1e3 * step_rad:.3g} mrad: its steps alone look like an error that swings (LIMIT_CYCLE); a share of "
+        f"{share:g} is {LEAST_STEPS:g} counts"
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
@@ -13,6 +14,13 @@ from pydantic_core import PydanticCustomError
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import split_channel
 from jointctl.drivers.canopen.cia import EVENT_DRIVEN, HIGHEST_NODE, LAST_SYNCHRONOUS
+from jointctl.drivers.canopen.pdo import (
+    coarse_numbers,
+    joint_torque_per_permille_Nm,
+    position_misfit,
+    torque_misfit,
+    velocity_misfit,
+)
 from jointctl.drivers.canopen.settings import (
     CanopenSettings,
     JointEncoderSettings,
@@ -191,6 +199,10 @@ class CanopenSection(DriveSection):
             f"drive.rated_current_A (={self.rated_current_A:g}) is {factor:.3g} times drive.rated_torque_Nm "
             f"(={self.rated_torque_Nm:g}): one of them is wrong, or rms and sine amplitude are mixed up"
         )
+
+    def coarse_numbers(self, config: Config) -> list[str]:
+        settings = canopen_settings(config)
+        return coarse_numbers(settings, _permille_Nm(settings))
 
     def measuring_constants(self) -> dict[str, float]:
         return {"rated_torque": float(self.torque_reference == "rated_torque")}
@@ -386,6 +398,23 @@ def canopen_problems(config: Config) -> list[str]:
     return found
 
 
+def _permille_Nm(settings: CanopenSettings) -> float:
+    """Joint torque of a thousandth of the rated value [Nm], as far as the file knows it; 0 else."""
+    return joint_torque_per_permille_Nm(
+        settings, 1e3 * (settings.rated_torque_Nm or 0.0), round(1e3 * (settings.rated_current_A or 0.0))
+    )
+
+
+def _misfits(config: Config) -> list[str]:
+    """What the drive's whole numbers cannot express, or would let the drive have beyond the limits."""
+    settings = canopen_settings(config)
+    found = [velocity_misfit(settings), position_misfit(settings)]
+    if permille_Nm := _permille_Nm(settings):
+        permille = settings.max_torque_permille or math.ceil(settings.torque_max_Nm / permille_Nm)
+        found.append(torque_misfit(settings, permille, permille_Nm))
+    return [f"{text}; {remedy}" for text, remedy in filter(None, found)]
+
+
 def cascade_problems(config: Config) -> list[str]:
     """drive.mode csp and csv against the rest."""
     drive, control = canopen_section(config), config.control
@@ -423,4 +452,4 @@ def cascade_problems(config: Config) -> list[str]:
             f'joint_encoder.law (=joint_encoder) needs control.kind "flexible_joint" (={control.kind}) with drive.mode '
             f"(={mode}): the drive closes its loop on encoder 6064"
         )
-    return found
+    return found + _misfits(config)

@@ -117,6 +117,10 @@ class DriveSection(Section, ABC):
         """By how much the constants that scale the torque contradict each other, in words too; None: unknown."""
         return None
 
+    def coarse_numbers(self, config: Config) -> list[str]:
+        """One line for each number that the drive sends or takes in steps which are coarse for the joint's limits."""
+        return []
+
     def measuring_constants(self) -> dict[str, float]:
         """What scales the readings of a sweep, besides the constants that all drives have."""
         return {}
