@@ -22,11 +22,11 @@ import numpy as np
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.eds import read_eds
-from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm
+from jointctl.drivers.canopen.pdo import RATED_TORQUE_UNITS_mNm, joint_velocity_per_unit_radps
+from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.canopen.watchdog import QUICK_STOP_RAMPS, needed_braking
 from jointctl.drivers.errors import BusError, ConfigurationError, DataError
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import CommandKind
 from jointctl.hil.arm_plant import ArmPlant, arm_plant
 from jointctl.hil.canopen.device import Cia402Device, DeviceRow, DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
@@ -162,7 +162,7 @@ def device_settings(config: Config) -> DeviceSettings:
         raise ConfigurationError(
             "drive.rated_current_A or drive.rated_torque_Nm is missing: the virtual drive needs it"
         )
-    unit_mNm = RATED_TORQUE_UNITS_mNm[drive.rated_torque_unit]
+    unit_mNm, settings = RATED_TORQUE_UNITS_mNm[drive.rated_torque_unit], canopen_settings(config)
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((current_A or (torque_Nm or 0.0) / constant_NmpA) * 1000.0),
@@ -175,7 +175,8 @@ def device_settings(config: Config) -> DeviceSettings:
         product_code=drive.product_code or product_code or 1,
         torque_limit=astuple(limit) if (limit := torque_limit_object(config)) is not None else None,
         shown=eds.dictionary if eds is not None else None,
-        quick_stop=_quick_stop(drive, config),
+        velocity_unit_radps=None if drive.velocity_unit == "counts/s" else joint_velocity_per_unit_radps(settings),
+        quick_stop=_quick_stop(drive, config, settings),
         **_second_encoder(config),
         **_drive_loops(drive, config),
     )
@@ -184,7 +185,7 @@ def device_settings(config: Config) -> DeviceSettings:
 USUAL_RAMPS_radps2 = {0x6084: 4.8, 0x6085: 12.0}  # at the joint, by the EDS
 
 
-def _quick_stop(drive: CanopenSection, config: Config) -> tuple[int, float] | None:
+def _quick_stop(drive: CanopenSection, config: Config, settings: CanopenSettings) -> tuple[int, float] | None:
     """The ramp of its quick stop (object, rad/s2 at the joint), where that of the EDS does not suit the joint.
 
     A real drive's is set to its joint: no faster than the torque can brake it, and no slower than its limits need; a
@@ -193,7 +194,7 @@ def _quick_stop(drive: CanopenSection, config: Config) -> tuple[int, float] | No
     index = QUICK_STOP_RAMPS.get(drive.quick_stop_option, 0)
     if not index:
         return None
-    of_loop, *of_limits = (radps2 for radps2, _ in needed_braking(canopen_settings(config)))
+    of_loop, *of_limits = (radps2 for radps2, _ in needed_braking(settings))
     most = (config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)) / config.joint.inertia_kgm2
     usual = USUAL_RAMPS_radps2[index]
     wanted = max(min(usual, most), *of_limits, 0.0 if drive.cascade is None else of_loop)
@@ -342,12 +343,6 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
     row = DeviceRow(new(Device, len(joints)), new(PlantConstants, len(joints)), new(PlantState, len(joints)))
     devices = []
     for index, config in enumerate(joints):
-        unit = canopen_section(config).velocity_unit
-        if unit != "counts/s" and config.drive.own_loop() is not CommandKind.TORQUE:
-            raise ConfigurationError(
-                f"{config.path}: drive.velocity_unit (={unit}) must be counts/s for the virtual drive to follow",
-                "leave it out of a copy of the file that is simulated",
-            )
         made = plant(**plant_settings(config))
         try:
             devices.append(

@@ -49,6 +49,7 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
+    velocity_unit_radps: float | None = None  # at the joint, of one unit of 60FF; None = counts of 6064 per s
     quick_stop: tuple[int, float] | None = None  # the object with its ramp, and that at the joint [rad/s2]; None = EDS
     torque_limit: tuple[int, int, float] | None = None  # the maker's own: index, sub, what it holds at rated torque
     shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
@@ -159,6 +160,10 @@ class Cia402Device:
         device.second_counts_prad = settings.second_counts_prad
         device.second_offset_counts = settings.second_offset_counts
         device.counts_per_rad = self.plant_constants[0].counts_prad
+        unit_radps = settings.velocity_unit_radps
+        device.velocity_units_prad = device.counts_per_rad
+        if unit_radps is not None:
+            device.velocity_units_prad = math.copysign(1.0 / unit_radps, device.counts_per_rad)
         objects.set_default(0x608F, 1, round(abs(device.counts_per_rad) * 2.0 * math.pi))
         objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
         objects.set_default(0x6075, 0, settings.rated_current_mA)

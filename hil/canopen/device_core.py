@@ -268,7 +268,7 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     drive.second_position = _int32(
         math.floor(link_reading_rad(plant_c, plant_s) * device.second_counts_prad + device.second_offset_counts + 0.5)
     )
-    drive.velocity = _int32(shaft_velocity_radps(plant_c, plant_s) * device.counts_per_rad)
+    drive.velocity = _int32(shaft_velocity_radps(plant_c, plant_s) * device.velocity_units_prad)
     current_A = device.torque_sign * plant_s.current_A
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / rated_torque_mNm(device))
@@ -288,7 +288,7 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
         drive.demand_position = drive.position
         drive.following_error = 0
     demand_radps = device.reference_velocity_radps if follows_velocity(device) else 0.0
-    drive.demand_velocity = _int32(demand_radps * device.counts_per_rad)
+    drive.demand_velocity = _int32(demand_radps * device.velocity_units_prad)
     drive.statusword = status_word(device)
 
 

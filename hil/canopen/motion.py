@@ -54,7 +54,7 @@ def _limit(value: float, bound: float) -> float:
 def _max_speed_radps(device: Device) -> float:
     drive = device.drive
     motor = int64(drive.max_motor_speed_rpm) * (2.0 * math.pi / 60.0) / device.reduction_ratio
-    return min(int64(drive.max_profile_velocity) / abs(device.counts_per_rad), motor)
+    return min(int64(drive.max_profile_velocity) / abs(device.velocity_units_prad), motor)
 
 
 @kernel
@@ -106,7 +106,7 @@ def _cyclic_position(device: Device, position_rad: float, velocity_radps: float,
         device.segment_target = target
         device.segment_left_s = period_s
         device.segment_velocity_radps = (target / device.counts_per_rad - device.reference_position_rad) / period_s
-    feed_radps = int64(device.drive.velocity_offset) / device.counts_per_rad
+    feed_radps = int64(device.drive.velocity_offset) / device.velocity_units_prad
     if device.segment_left_s > 0.5 * dt_s:
         feed_radps += device.velocity_feed * device.segment_velocity_radps
         device.reference_position_rad += device.segment_velocity_radps * dt_s
@@ -153,11 +153,11 @@ def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: flo
         target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
         return device.demand + _limit(target - device.demand, int64(drive.torque_slope) * dt_s)
     if mode == Mode.CYCLIC_VELOCITY:
-        target_radps = (int64(drive.target_velocity) + int64(drive.velocity_offset)) / device.counts_per_rad
+        target_radps = (int64(drive.target_velocity) + int64(drive.velocity_offset)) / device.velocity_units_prad
         device.reference_velocity_radps = _limit(target_radps, _max_speed_radps(device))
         return _velocity_loop(device, velocity_radps, dt_s) + device.torque_sign * float(drive.torque_offset)
     if mode == Mode.PROFILE_VELOCITY:
-        target_radps = 0.0 if drive.controlword & _HALT else int64(drive.target_velocity) / device.counts_per_rad
+        target_radps = 0.0 if drive.controlword & _HALT else int64(drive.target_velocity) / device.velocity_units_prad
         _ramp_velocity(device, _limit(target_radps, _max_speed_radps(device)), dt_s)
         return _velocity_loop(device, velocity_radps, dt_s)
     if mode == Mode.CYCLIC_POSITION:

@@ -247,6 +247,7 @@ class Device:
     node_id: i4
     reduction_ratio: f8
     counts_per_rad: f8  # at the joint; negative when the encoder counts against the joint
+    velocity_units_prad: f8  # of 60FF, 60B1, 606B, 606C and 607F in a rad/s of the joint, with the same sign
     makers_limit_rated_counts: f8  # what `makers_limit` holds at rated torque; 0 = there is no such object
     rated_torque_unit_mNm: f8  # of 6076
     motor_torque_constant_NmpA: f8  # turns the current limit 6073 into a torque limit

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from jointctl.drivers.canopen.watchdog import needed_braking
+from jointctl.firmware_py.states import Fault
+from jointctl.hil.canopen.device_core import sample_objects
+from jointctl.hil.lockstep import TRUE_POSITION_rad
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
 from jointctl.tools.lockstep import LockstepJoint
@@ -55,3 +61,31 @@ def test_in_torque_mode_it_is_what_the_limits_need() -> None:
     assert config.sequence.brake_radps2 < 3.0
     assert ramp_radps2(config.changed(sequence__brake_radps2=30.0)) == pytest.approx(11.98, abs=0.01)
     assert ramp_radps2(config.changed(limits__velocity_max_radps=9.0)) == pytest.approx(13.5, rel=0.01)
+
+
+@pytest.mark.parametrize("unit", ["r/min", "0.1 r/min"])
+@pytest.mark.parametrize("mode", ["csp", "csv"])
+@pytest.mark.parametrize(("name", "side", "direction"), [("base", "motor", -1), ("wrist", "joint", 1)])
+def test_it_takes_velocities_in_the_unit_of_the_file(
+    mode: str, unit: Any, name: str, side: Any, direction: Any
+) -> None:
+    """It was refused: only counts per s were known."""
+    config = own_loop_joint(
+        SIZES[name], mode, drive__velocity_unit=unit, encoder__side=side, encoder__direction=direction,
+        drive__torque_direction=direction, trajectory__duration_s=4.0,
+    )  # fmt: skip
+    joint = LockstepJoint(config)
+    run, plain = joint.run(), LockstepJoint(config.changed(drive__velocity_unit="counts/s")).run()
+    assert run.fault is Fault.NONE
+    assert abs(run.true_error_rad[run.tracking]).max() < 0.02 * config.limits.following_error_max_rad
+    assert np.ptp(run.truth[:, TRUE_POSITION_rad] - plain.truth[:, TRUE_POSITION_rad]) > 0.0  # rounded otherwise
+
+
+@pytest.mark.parametrize(("unit", "motor_radps"), [("r/min", math.tau / 60.0), ("0.1 r/min", math.tau / 600.0)])
+def test_it_reports_velocities_in_that_unit_and_with_the_encoders_sign(unit: Any, motor_radps: float) -> None:
+    direct = SIZES["direct drive"]
+    config = own_loop_joint(direct, "csv", drive__velocity_unit=unit, encoder__direction=-1)
+    device = new_device(config)
+    device.plant_state[0].joint_velocity_radps = 3.0
+    sample_objects(device.device[0], device.plant_constants[0], device.plant_state[0])
+    assert int(device.device[0].drive.velocity) == pytest.approx(-3.0 / motor_radps, abs=1.0)
