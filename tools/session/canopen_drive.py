@@ -15,7 +15,7 @@ from jointctl.drivers.canopen.cia import EVENT_DRIVEN, State, state_of_word, sta
 from jointctl.drivers.drive import Drive, DriveGroup
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram
-from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.states import CommandKind, Fault
 from jointctl.tools.configuration.canopen import RPDO_BYTES, canopen_section, canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.config import Config, first_on_bus
 from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
@@ -84,8 +84,10 @@ class CanopenSession(SessionDrive):
     def fault_text(
         self, config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0
     ) -> FaultText:
-        two_encoders = config.joint_encoder is not None
-        return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
+        return fault_text(
+            fault, value, drive_error, encoder_error, two_encoders=config.joint_encoder is not None,
+            own_loop=config.drive.own_loop() is not CommandKind.TORQUE,
+        )  # fmt: skip
 
     def error_text(self, code: int) -> str:
         return f"EMCY {emergency_text(code)}"

@@ -103,6 +103,7 @@ class FaultWords(FaultText):
 
     two_encoders: FaultText | None = None  # with [joint_encoder] a sample counts only once both encoders have answered
     follows_pause: bool = False  # a loop that stands still commands its last torque, and receives nothing
+    own_loop: tuple[str, str] | None = None  # (cause, next step) where the drive closes its own loop, [drive.cascade]
 
 
 FAULT_TEXTS: dict[Fault, FaultWords] = {
@@ -117,6 +118,10 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "wrong sign of encoder or torque, or gains that the loop delay does not allow",
         "check encoder.direction and drive.torque_direction before the next run",
         follows_pause=True,
+        own_loop=(
+            "wrong sign of encoder or velocity (607E), or gains of the drive that its joint does not allow",
+            "check encoder.direction and the drive's gains, run `jointctl check`, all before the next run",
+        ),
     ),
     Fault.REFERENCE_LIMIT: FaultWords(
         "the desired motion would leave the limits at {value:.4f} rad",
@@ -128,6 +133,11 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "blocked or overloaded joint, wrong sign of encoder or torque, or too little torque",
         "turn the joint by hand with the power off; check the directions and limits.torque_max_Nm",
         follows_pause=True,
+        own_loop=(
+            "blocked or overloaded joint, gains of the drive too low for friction, wrong sign of encoder or torque, "
+            "or a drive whose own limits (6072, 607F) are below those of the file",
+            "turn the joint by hand with the power off; run `jointctl check`; compare its gains with [drive.cascade]",
+        ),
     ),
     Fault.STALE_SAMPLE: FaultWords(
         "no position came for {value:.0f} cycles, at once or again and again",
@@ -149,6 +159,10 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the torque stayed at its limit ({torque}) for too long",
         "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
         "turn the joint by hand with the power off, then look at the friction values",
+        own_loop=(
+            "the joint is blocked, limits.torque_max_Nm too low for load and friction, or the drive's gains too high",
+            "turn the joint by hand with the power off, then look at the drive's gains and at limits.torque_max_Nm",
+        ),
     ),
     Fault.LIMIT_CYCLE: FaultWords(
         "torque or error swung back and forth at about {value:.1f} Hz instead of settling",
@@ -157,6 +171,11 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "run `jointctl check`; then lower the gains (kp, kv, observer_radps), switch learning off, "
         "or measure with more counts",
         follows_pause=True,
+        own_loop=(
+            "gains of the drive that are too high for its joint, or so low that its integral pushes against friction "
+            "until the joint slips; in CSV a high drive.cascade.position_gain_ps; or an encoder of too few counts",
+            "run `jointctl check`; change the drive's gains with its maker's software, and [drive.cascade] with them",
+        ),
     ),
     Fault.CLIENT_SILENT: FaultWords(
         "the program that commands the joint was silent for {value:.2f} s",
@@ -200,6 +219,10 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the joint did not come to rest ({value:.3f} rad/s)",
         "unstable gains or an outside torque",
         "lower the gains; look at the last seconds of the run log",
+        own_loop=(
+            "gains of the drive that its joint does not allow, or an outside torque",
+            "look at the last seconds of the run log; change the drive's gains with its maker's software",
+        ),
     ),
     Fault.OFF_TIMEOUT: FaultWords(
         "the drive did not confirm that its power stage is off (statusword {word})",
@@ -290,14 +313,23 @@ def _word_text(value: float) -> str:
 
 
 def fault_text(
-    fault: Fault, value: float, drive_error: int, encoder_error: int = 0, *, two_encoders: bool = False
+    fault: Fault,
+    value: float,
+    drive_error: int,
+    encoder_error: int = 0,
+    *,
+    two_encoders: bool = False,
+    own_loop: bool = False,
 ) -> FaultText:
     """The text of a fault with its numbers filled in; a drive that stopped because it did not hear us says so.
 
     `encoder_error`: see `Sample.encoder_error`.  `two_encoders`: a sample is the answer of both.
+    `own_loop`: the drive closes its own loop, so that its gains are the drive's.
     """
     row = FAULT_TEXTS[fault]
     text = row.two_encoders if two_encoders and row.two_encoders else row
+    if own_loop and row.own_loop:
+        text = FaultText(text.happened, *row.own_loop)
     if encoder_error and row.two_encoders:
         text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
     happened = text.happened.format(value=value, torque=text_Nm(value), word=_word_text(value))

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,6 +46,7 @@ from jointctl.tools.session.session_drive import latched_text, session_drive
 from jointctl.tools.sweeping import carry_out
 from jointctl.tools.verbs import scope as scope_module
 from jointctl.tools.verbs.doctor import doctor_motion
+from tests.configurations import own_loop, shipped
 from tests.run_records import START_NS, WORDS, eventful_records, run_records
 
 # --- What the user is told of each fault: what happened with numbers, code and name, likely cause, next step ---
@@ -52,6 +54,18 @@ FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
 WITH_STATUSWORD = (
     Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.ENABLE_TIMEOUT, Fault.OFF_TIMEOUT, Fault.DRIVE_STAYS_ENABLED,
 )  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
+def test_a_drive_that_closes_its_own_loop_is_not_blamed_on_gains_that_are_not_used(fault: Fault, mode: str) -> None:
+    """LIMIT_CYCLE in CSP sent its reader to kp, kv and observer_radps."""
+    config = shipped("virtual") if mode == "cst" else own_loop(mode)
+    text = session_drive("canopen").fault_text(config, fault, 1.0, 0)
+    ours = re.compile(r"\b(kp|kv|observer_radps|learning|lower the gains|loop delay)\b")
+    of_gains = (Fault.LIMIT_CYCLE, Fault.STOP_TIMEOUT, Fault.VELOCITY_LIMIT)
+    assert bool(ours.search(text.advice)) is (mode == "cst" and fault in of_gains)
+    assert text.happened == fault_text(fault, 1.0, 0).happened
 
 
 @pytest.mark.parametrize("fault", FAULTS)
