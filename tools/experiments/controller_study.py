@@ -111,7 +111,7 @@ REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
     20: (1.6e4, (2.5e4, 2.9e4), (7.0, 25.0)),
     25: (3.1e4, (5.0e4, 5.7e4), (14.0, 48.0)),
 }
-SIZED_Nm = 60.0  # limits.torque_max_Nm of the joint that the ranges suit
+SIZED_Nm, SIZED_kgm2 = 60.0, 2.1  # limits.torque_max_Nm and joint.inertia_kgm2 of the joint that the ranges suit
 ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
 DELAY_ERROR_s = 0.2e-3  # by which the loop delay is measured wrong
 CURVE_degC = 25.0  # at which [friction] holds as it stands
@@ -125,7 +125,10 @@ def _sizes(value: tuple[int, ...]) -> tuple[int, ...]:
 
 
 class EnsembleSettings(Section):
-    """Ranges of the plants; (low, high) are uniform unless the comment says otherwise."""
+    """Ranges of the plants; (low, high) are uniform unless the comment says otherwise.
+
+    Torques are for a joint of `SIZED_Nm`; for another joint `sized` scales those that are not given.
+    """
 
     friction_scale: Annotated[Interval, _FromList, _interval(0.0, 10.0)] = (0.9, 1.1)  # per direction
     stick_slip_share: Annotated[float, between(0.0, 1.0)] = 0.25  # the others have LuGre friction
@@ -246,9 +249,22 @@ def _loaded(base: Config, settings: EnsembleSettings, random: np.random.Generato
     }  # fmt: skip
 
 
+def sized(base: Config, settings: EnsembleSettings) -> EnsembleSettings:
+    """The settings whose torques, where they are not given, go with the joint's own; damping with inertia too."""
+    torque = base.limits.torque_max_Nm / SIZED_Nm
+    damping = math.sqrt(torque * base.joint.inertia_kgm2 / SIZED_kgm2)
+    ranges = {
+        name: tuple(torque * end for end in getattr(settings, name))
+        for name in ("torque_ripple_Nm", "bristle_stiffness_Nmprad", "pendulum_Nm")
+    }
+    scaled = {**ranges, "bristle_damping_Nmspr": damping * settings.bristle_damping_Nmspr}
+    given = settings.model_fields_set
+    return settings.model_copy(update={name: value for name, value in scaled.items() if name not in given})
+
+
 def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:
     """The configuration with the virtual joint number `index` of the study with this seed."""
-    random = np.random.default_rng([seed, index])
+    random, settings = np.random.default_rng([seed, index]), sized(base, settings)
 
     def uniform(interval: tuple[float, float]) -> float:
         return float(random.uniform(*interval))

@@ -441,6 +441,9 @@ def controller_config(base: Config, controller: Controller) -> Config:
         update["friction"] = controller.friction
     drive = base.drive
     if controller.cascade:
+        # the filter is no part of such a law: with it the loop supervises the velocity, at the rate of the base
+        cutoff_Hz = base.control.velocity_cutoff_Hz
+        update["control"] = controller.control.model_copy(update={"velocity_cutoff_Hz": cutoff_Hz})
         if drive.own_loop() is CommandKind.TORQUE:
             raise ConfigurationError(
                 f"controller {controller.name} needs a --base with drive.mode csp or csv",

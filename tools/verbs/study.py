@@ -65,7 +65,7 @@ _MEANINGS = (
         "stuck: share of a creeping motion in which the joint stands; later: from 0.5 s after each turn on",
     ),
 )
-OTHER_SIZE = 5.0  # times: a controller, or ranges of plants, of another joint
+OTHER_SIZE = 5.0  # times: a controller of another joint
 _BOXES = (
     "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
 )
@@ -159,26 +159,18 @@ def _write(
 
 
 def size_warnings(base: Config, settings: StudySettings) -> list[str]:
-    """Where controllers are of another joint than the plants, or the plants' ranges of one of another size."""
-    from jointctl.tools.configuration.load import load_config
-    from jointctl.tools.experiments.controller_study import SIZED_Nm
+    """Where controllers are of another joint than the plants."""
+    from jointctl.tools.configuration.load import load_config, shipped_config
 
     found, plants_kgm2 = [], base.joint.inertia_kgm2
     for name in settings.controllers:
-        own_kgm2 = load_config(Path(name)).joint.inertia_kgm2 if Path(name).is_file() else plants_kgm2
+        path = next((path for path in (Path(name), shipped_config(name)) if path.is_file()), None)
+        own_kgm2 = plants_kgm2 if path is None else load_config(path).joint.inertia_kgm2
         if not 1.0 / OTHER_SIZE <= own_kgm2 / plants_kgm2 <= OTHER_SIZE:
             found.append(
                 f"{name} is of a joint of {own_kgm2:.3g} kg m2, and the plants are joints of {plants_kgm2:.3g} kg m2: "
                 f"--base {name} draws plants of that joint"
             )
-    limit_Nm, given = base.limits.torque_max_Nm, settings.plant.model_fields_set
-    sized = ("torque_ripple_Nm", "bristle_stiffness_Nmprad", "bristle_damping_Nmspr")
-    of_size = [key for key in sized if key not in given]
-    if of_size and not 1.0 / OTHER_SIZE <= limit_Nm / SIZED_Nm <= OTHER_SIZE:
-        found.append(
-            f"{', '.join(f'plant.{key}' for key in of_size)} of the random plants suit a joint of {SIZED_Nm:g} Nm, and "
-            f"base (={settings.base}) has limits.torque_max_Nm (={limit_Nm:g}): give them in --file"
-        )
     return found
 
 

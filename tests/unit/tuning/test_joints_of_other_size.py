@@ -17,7 +17,8 @@ from jointctl.tools.analysis.margin_gate import refuse_chatter
 from jointctl.tools.configuration.config import Adaptation, Config
 from jointctl.tools.configuration.conversions import static_friction_Nm, turning_of, velocity_of_a_step_1ps
 from jointctl.tools.configuration.records import axis_constants
-from jointctl.tools.experiments.controller_study import EnsembleSettings, StudySettings
+from jointctl.tools.experiments.controller_study import EnsembleSettings, StudySettings, random_plant, sized
+from jointctl.tools.experiments.scenarios import controller_config, named
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import PEAK, TRAVEL_rad, config_of_check, make_plan
 from jointctl.tools.sweeping.excitation import designed
@@ -36,9 +37,9 @@ from jointctl.tools.tuning.frequency_response import (
 from jointctl.tools.tuning.presliding import presliding_motion
 from jointctl.tools.verbs.map import MapOptions, config_of_map
 from jointctl.tools.verbs.study import size_warnings
-from jointctl.tools.virtual_joint import device_settings
+from jointctl.tools.virtual_joint import device_settings, new_device
 from tests.configurations import shipped, written
-from tests.joint_sizes import SIZES, Size, joint
+from tests.joint_sizes import SIZES, Size, joint, own_loop_joint
 from tests.unit.inspection.test_motion_check import checked
 
 each_size = pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
@@ -199,12 +200,40 @@ def test_a_study_says_whose_joint_its_plants_are(tmp_path: Path, name: str | Non
     assert all(word in line for word, line in zip(words, said, strict=True))
 
 
-def test_a_study_of_another_size_names_the_ranges_that_do_not_suit() -> None:
-    finger = joint(SIZES["finger"])
-    (said,) = size_warnings(finger, StudySettings(controllers=("precise",)))
-    assert "plant.torque_ripple_Nm, plant.bristle_stiffness_Nmprad, plant.bristle_damping_Nmspr" in said
-    own = EnsembleSettings(torque_ripple_Nm=(0.0, 2e-3), bristle_stiffness_Nmprad=(1.0, 9.0), bristle_damping_Nmspr=0.0)
-    assert size_warnings(finger, StudySettings(controllers=("precise",), plant=own)) == []
+@pytest.mark.parametrize("name", ["finger", "wrist", "direct drive", "base"])
+def test_the_plants_of_a_study_are_of_the_size_of_its_base(name: str) -> None:
+    """A finger's had bristles of 60 Nm, which no step of its simulation bears, and as much torque ripple as torque."""
+    size = SIZES[name]
+    base = joint(size)
+    for index in range(5):
+        plant = random_plant(base, EnsembleSettings(stick_slip_share=0.0), 4711, index)
+        assert plant.virtual is not None
+        assert 0.0 < max(plant.virtual.torque_ripple_Nm) <= 0.025 * size.torque_Nm
+        assert 500.0 <= plant.virtual.bristle_stiffness_Nmprad / size.torque_Nm <= 4200.0
+        assert new_device(plant)
+
+
+def test_a_study_says_that_a_shipped_file_is_of_another_joint_too() -> None:
+    """csp brings gains for 2.1 kg m2 in [drive.cascade]: every run on a wrist was a fault."""
+    wrist = own_loop_joint(SIZES["wrist"], "csp")
+    (line,) = size_warnings(wrist, StudySettings(controllers=("drive_alone", "csp")))
+    assert line.startswith("csp is of a joint of 2.1 kg m2, and the plants are joints of 0.05 kg m2")
+
+
+def test_a_study_with_a_slow_bus_has_the_filter_of_its_base() -> None:
+    """The 100 Hz of the paper's law, which such a drive does not use, were refused at 100 Hz."""
+    slow = own_loop_joint(SIZES["slow base"]._replace(rate_Hz=100.0), "csv")
+    for controller in named(("drive_alone", "drive_without_torque")):
+        assert controller_config(slow, controller).control.velocity_cutoff_Hz == slow.control.velocity_cutoff_Hz == 20.0
+
+
+def test_what_a_study_is_given_and_the_shipped_joints_are_not_scaled() -> None:
+    own = EnsembleSettings(torque_ripple_Nm=(0.0, 2e-3), bristle_damping_Nmspr=3.0)
+    found = sized(joint(SIZES["finger"]), own)
+    assert (found.torque_ripple_Nm, found.bristle_damping_Nmspr) == ((0.0, 2e-3), 3.0)
+    assert found.bristle_stiffness_Nmprad == pytest.approx((150.0, 1250.0))
+    for name in ("precise", "realistic", "csp", "paper"):
+        assert sized(shipped(name), EnsembleSettings()) == EnsembleSettings()
 
 
 @pytest.mark.parametrize("believed_kgm2", [0.3, 0.6, 1.5, 2.1, 5.0])
