@@ -388,6 +388,23 @@ def test_a_refused_set_point_is_told_at_its_field(bench: Any, browser: Browser) 
     tab.until(f"{field}.innerText.includes('position_rad is empty: must be a number')")
 
 
+def test_with_a_drive_that_closes_its_own_loop_motions_are_offered_and_no_gains(bench: Any, browser: Browser) -> None:
+    """All of the panel was hidden in CSP and CSV, since there are no gains to show."""
+    cascade = {"position_gain_ps": 30.0, "velocity_gain_Nmspr": 200.0, "velocity_integral_Nmprad": 10_000.0}
+    _, tab, _ = opened(
+        bench, browser, drive__mode="csv", drive__cascade=cascade, control__kind="computed_torque",
+        limits__position_min_rad=-0.2, limits__position_max_rad=0.2, trajectory__amplitude_rad=0.05,
+        limits__swing_error_share=1.0,
+    )  # fmt: skip
+    start(tab)
+    shown = "[...document.querySelectorAll('[data-testid=\"{}\"]')].some(e => e.offsetParent !== null)"
+    tab.until(shown.format("set-point"))
+    assert not tab.js(shown.format("apply"))
+    tab.enter("set-point", "0.15")
+    tab.click("go")
+    tab.until("document.body.innerText.includes('set-point +0.1500 rad')")
+
+
 def test_stop_before_start_ends_the_preparation(bench: Any, browser: Browser) -> None:
     _, tab, _ = opened(bench, browser)
     tab.click("stop")

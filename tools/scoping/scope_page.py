@@ -207,21 +207,31 @@ class StartPanel:
 # --- what may be changed while it moves: set-point, trajectory, gains; and the recording ---
 
 # kind -> key -> (label, first value)
-FIELDS: dict[str, dict[str, tuple[str, float]]] = {
-    "configured": {},
-    "sine": {
-        "amplitude_rad": ("amplitude [rad]", 0.1), "frequency_Hz": ("frequency [Hz]", 0.2),
-        "offset_rad": ("offset [rad]", 0.0),
-    },
-    "min_jerk": {
-        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "move_s": ("move [s]", 2.0),
-        "dwell_s": ("rest [s]", 0.5),
-    },
-    "trapezoid": {
-        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "speed_radps": ("speed [rad/s]", 0.1),
-        "acceleration_radps2": ("acceleration [rad/s2]", 0.5), "dwell_s": ("rest [s]", 0.5),
-    },
-}  # fmt: skip
+KINDS = ("configured", "sine", "min_jerk", "trapezoid")
+SPEED_SHARE = 0.25  # of limits.velocity_max_radps, at most, of a motion that is offered
+PEAK_OF_MIN_JERK = 1.9  # its greatest speed over the mean one, rounded up
+
+
+def offered(kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
+    """Values of a motion by key, small and slow for the joint, about zero or, if that is outside, its middle."""
+    if not settings:
+        return {}
+    low, high = settings["range"]
+    size = min(0.1, 0.15 * (high - low))
+    middle = 0.0 if low + size <= 0.0 <= high - size else 0.5 * (low + high)
+    speed = SPEED_SHARE * settings["velocity_max_radps"]
+    move = {"start_rad": middle, "target_rad": middle + size}
+    values = {
+        "sine": {"amplitude_rad": size, "frequency_Hz": min(0.2, speed / (math.tau * size)), "offset_rad": middle},
+        "min_jerk": {**move, "move_s": max(2.0, PEAK_OF_MIN_JERK * size / speed), "dwell_s": 0.5},
+        "trapezoid": {
+            **move, "speed_radps": min(0.1, speed),
+            "acceleration_radps2": min(0.5, 0.5 * settings["brake_radps2"]), "dwell_s": 0.5,
+        },
+    }  # fmt: skip
+    return {key: round(value, 4) for key, value in values.get(kind, {}).items()}
+
+
 ENDLESS = "a set-point, sine, move or trapezoid goes on until it is stopped; the configured motion ends by itself"
 UNITS = {"kp": "kp [1/s2]", "kv": "kv [1/s]", "ki": "ki [1/s3]", "observer_radps": "observer [rad/s]",
          "learning_rate": "learning rate"}  # fmt: skip
@@ -275,6 +285,7 @@ class ChangePanels:
     def __init__(self, ask: Ask, who: str) -> None:
         self._pass_on, self._who = ask, who
         self._asked = ""  # the kind of the last request from here
+        self._limits: Mapping[str, Any] = {}  # of the joint, among the settings that were shown last
         self._refusals: int | None = None  # seen so far; None: what was before this page was opened is not known
         self._gains: dict[str, Followed] = {}
         self._given: dict[str, Any] = {}
@@ -286,13 +297,13 @@ class ChangePanels:
                 self._angle = Followed(self._set_point, ".4f").watch_focus()
                 _button("Go", self._go, "go")
             with _card("Trajectory"):
-                kinds = {kind: kind.replace("_", " ") for kind in FIELDS}
+                kinds = {kind: kind.replace("_", " ") for kind in KINDS}
                 self._kind = ui.select(kinds, value="configured", on_change=self._on_kind).classes("w-full")
                 self._kind.props('dense options-dense data-testid="kind"')
                 self._fields = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
                 _button("Apply trajectory", self._follow, "follow")
             ui.label(ENDLESS).classes("text-xs scope-aside")
-            with _card("Gains"):
+            with _card("Gains") as self._gains_card:
                 self._gain_rows = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
                 _button("Apply", self._apply, "apply")
             self._record = _button("Record", self._on_record, "record").classes("w-full")
@@ -309,8 +320,10 @@ class ChangePanels:
         self._given = {}
         self._fields.clear()
         with self._fields:
-            for key, (label, value) in FIELDS[self._kind.value].items():
-                self._given[key] = ui.number(label, value=value, format="%.4g").props(f'dense data-testid="{key}"')
+            for key, value in offered(self._kind.value, self._limits).items():
+                what, unit = key.replace("dwell", "rest").rsplit("_", 1)
+                field = ui.number(f"{what} [{unit.replace('radps', 'rad/s')}]", value=value, format="%.4g")
+                self._given[key] = field.props(f'dense data-testid="{key}"')
 
     def _follow(self) -> None:
         kind = self._kind.value
@@ -331,9 +344,14 @@ class ChangePanels:
         self._ask("record", {"on": not self._recording})
 
     def show(self, settings: Mapping[str, Any]) -> None:
-        """Gains appear when the supervisor tells them; what the viewer has typed stays."""
+        """What may be changed, as the supervisor tells: no gains where they are the drive's.  What is typed stays."""
         gains: Mapping[str, Any] = settings.get("gains", {})
-        self._column.visible = settings.get("stage") == "running" and bool(gains)
+        self._column.visible = settings.get("stage") == "running" and "range" in settings
+        self._gains_card.visible = bool(gains)
+        if self._column.visible:
+            self._limits = settings
+            low, high = settings["range"]
+            self._set_point.props(f"step={min(0.01, (high - low) / 50.0):.1g}")
         if not self._column.visible:
             self._forget_refusals()
         if set(gains) != set(self._gains):

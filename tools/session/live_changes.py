@@ -368,6 +368,8 @@ class LiveChanges:
             "gains": {name: (low, now[name], high) for name, (low, high) in self.limits().items()},
             "motion": self.motion(),
             "range": (limits.position_min_rad, limits.position_max_rad),
+            "velocity_max_radps": limits.velocity_max_radps,
+            "brake_radps2": self._config.sequence.brake_radps2,
             "reference_rad": self.reference_rad,
             "under_way": self.under_way,
             "refused": self.refused,

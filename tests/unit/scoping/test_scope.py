@@ -579,7 +579,8 @@ def test_what_was_refused_in_a_run_that_has_ended_is_forgotten() -> None:
         page.refused(kind, count)
     assert page.errors() == ("no",) * 4
     page.panels._column = SimpleNamespace(visible=True)
-    page.panels._gain_rows, page.panels._record, page.panels._recorded = MagicMock(), MagicMock(), MagicMock()
+    for name in ("_gain_rows", "_gains_card", "_record", "_recorded"):
+        setattr(page.panels, name, MagicMock())
     page.panels.show({"stage": "ended"})
     assert page.errors() == (None,) * 4
 
