@@ -51,6 +51,20 @@ def test_the_panel_tells_state_error_torque_deadlines_and_time_left() -> None:
     assert "loop delay 1.00 ms" in text
 
 
+@pytest.mark.parametrize(
+    ("torque_Nm", "limit_Nm", "words"),
+    [(0.0123, 0.3, "+0.0123 Nm"), (-20.0, 60.0, "-20.00 Nm"), (-20.0, 0.0, "-20.00 Nm"), (812.3, 1000.0, "+812.30 Nm")],
+)
+def test_the_panel_has_the_digits_that_the_joint_needs(torque_Nm: float, limit_Nm: float, words: str) -> None:
+    """A finger of 0.3 Nm showed +0.01 Nm."""
+    shown = dataclasses.replace(
+        snapshot(command_torque_Nm=torque_Nm, velocity_radps=0.00123), torque_max_Nm=limit_Nm, velocity_max_radps=0.05
+    )
+    text = text_of(panel("joint: sine", "tracking", shown, []))
+    assert words in text
+    assert "+0.00123 rad/s" in text
+
+
 @pytest.mark.parametrize(("temperature_degC", "words"), [(41.26, "temperature 41.3 °C"), (None, "temperature -")])
 def test_the_panel_tells_the_temperature_where_the_drive_does(temperature_degC: float | None, words: str) -> None:
     shown = dataclasses.replace(snapshot(velocity_radps=-0.25), temperature_degC=temperature_degC)

@@ -211,7 +211,9 @@ def summary_table(summary: RunSummary) -> Table:
         if error is not None:
             low, high = error.range_rad.least * 1e3, error.range_rad.greatest * 1e3
             span = f"{error.from_s:z.1f}..{error.to_s:z.1f} s"
-            table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
+            digits = decimals_of(max(-low, high), 3)
+            values = f"{low:.{digits}f} .. {high:.{digits}f} mrad, RMSE {error.rmse_rad * 1e3:.{digits}f}"
+            table.add_row(f"{name} ({span})", values)
     table.add_row("within 1 mrad for good", _settled_text(summary))
     for name, torque, digits in torques_of(summary):
         if torque is not None:

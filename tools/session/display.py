@@ -19,7 +19,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.drivers.errors import message_line, printable
+from jointctl.drivers.errors import decimals_of, message_line, printable
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, StopRequest, fault_name, in_words
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
@@ -94,6 +94,12 @@ class Snapshot:
     temperature_degC: float | None = None  # None: the drive tells none, or not now
     joint: str = ""  # which joint of an arm
     axis: int = 0  # its number
+    torque_max_Nm: float = 0.0  # limits, a hundredth of which is to be seen in two digits; 0 = not known
+    velocity_max_radps: float = 0.0
+
+    @property
+    def torque_decimals(self) -> int:
+        return decimals_of(0.01 * self.torque_max_Nm, 2)
 
 
 class Display:
@@ -390,9 +396,9 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
         f"{float(record.error_rad) * 1e3:+8.3f} mrad" if active else "-",
         Text(fault_words(fault), style="bold red") if fault else "none",
         f"{float(record.position_rad):+8.4f} rad",
-        f"{float(record.command_torque_Nm):+8.2f} Nm",
-        f"{float(record.velocity_radps):+7.3f} rad/s",
-        f"{float(record.measured_torque_Nm):+8.2f} Nm",
+        f"{float(record.command_torque_Nm):+8.{snapshot.torque_decimals}f} Nm",
+        f"{float(record.velocity_radps):+7.{decimals_of(0.01 * snapshot.velocity_max_radps, 3)}f} rad/s",
+        f"{float(record.measured_torque_Nm):+8.{snapshot.torque_decimals}f} Nm",
         time_left(float(record.trajectory_s), snapshot.duration_s, int(record.phase)),
         "-" if snapshot.temperature_degC is None else f"{snapshot.temperature_degC:.1f} °C",
         f"{p99_s * 1e6:.0f} us" if np.isfinite(p99_s) else "-",
@@ -412,7 +418,8 @@ def _joint_rows(joints: Mapping[str, Snapshot]) -> Table:
         fault = int(record.fault)
         table.add_row(
             Text(name), phase_name(int(record.phase)), f"{float(record.position_rad):+.4f}",
-            f"{float(record.error_rad) * 1e3:+.3f}" if active else "-", f"{float(record.command_torque_Nm):+.2f}",
+            f"{float(record.error_rad) * 1e3:+.3f}" if active else "-",
+            f"{float(record.command_torque_Nm):+.{snapshot.torque_decimals}f}",
             Text(fault_words(fault), style="bold red") if fault else "none",
         )  # fmt: skip
     return table

@@ -455,7 +455,11 @@ class RunWatch:
         duration_s = float(self.loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
         drive = self.config.drive.kind
         degC = self.temperature.newest_degC
-        self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, drive, records, degC))
+        limits = self.config.limits
+        self.display.show(Snapshot(
+            records[-1], skipped, histograms, duration_s, drive, records, degC,
+            torque_max_Nm=limits.torque_max_Nm, velocity_max_radps=limits.velocity_max_radps,
+        ))  # fmt: skip
 
     def _keep(self, records: np.recarray) -> None:
         """Into the log, and kept for the summary at the end."""

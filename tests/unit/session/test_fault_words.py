@@ -223,7 +223,7 @@ def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
     watch._notices, watch._events = NoticeFinder(), SimpleNamespace(take=lambda _: [fault])
     watch._tell = lambda event, shown=True: told.append(event)
     watch.config, watch.temperature = (
-        SimpleNamespace(drive=SimpleNamespace(kind="canopen")),
+        shipped("virtual"),
         SimpleNamespace(newest_degC=None),
     )
     watch.display = SimpleNamespace(show=lambda _: None, note=noted.append)
