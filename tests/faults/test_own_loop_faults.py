@@ -14,6 +14,7 @@ from jointctl.hil.faults import FaultConstants, FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.configurations import own_loop
+from tests.joint_sizes import SIZES, own_loop_joint
 
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 DEAD_AT_s = 3.0
@@ -82,3 +83,30 @@ def test_its_twin_a_computer_that_was_away_for_a_moment_goes_on(joint: LockstepJ
     run = joint.run_with_faults(dead_from(kind, 0.015), epoch_at_start=True)
     assert run.fault is Fault.NONE
     assert np.abs(run.log.error_rad[run.tracking]).max() < 0.02
+
+
+@pytest.mark.parametrize("mode", ["csp", "csv"])
+@pytest.mark.parametrize("name", SIZES)
+def test_a_joint_of_any_size_is_off_and_at_rest_after_each_end_of_its_control(name: str, mode: str) -> None:
+    """A quick stop of 12 rad/s2 alone was too slow for a finger's range and too fast for a base joint's torque."""
+    size = SIZES[name]
+    joint = LockstepJoint(own_loop_joint(size, mode, trajectory__duration_s=3.0))
+    healthy = joint.run()
+    begins_s = 1e-9 * float(healthy.log.time_ns[int(np.argmax(healthy.tracking))] - healthy.log.time_ns[0])
+    for kind, magnitude, expected in (
+        (FaultKind.LOOP_KILLED, 1.0, {Fault.NONE}),
+        (FaultKind.BUS_OFF, 1.0, {Fault.BUS_ERROR}),
+        (FaultKind.DRIVE_FAULT, float(0x2310), {Fault.DRIVE_FAULT}),
+        (FaultKind.ENCODER_REVERSED, 1.0, {Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT}),
+    ):
+        fault = new(FaultConstants, 1)
+        fault[0].kind, fault[0].start_s, fault[0].duration_s = kind, begins_s + 1.0, 100.0
+        fault[0].magnitude = magnitude
+        run = joint.run_with_faults(fault, tail_s=3.0)
+        speeds = np.abs(run.truth[:, TRUE_VELOCITY_radps])
+        assert run.fault in expected
+        assert run.truth[-1, TRUE_POWER_STATE] not in POWERED
+        assert speeds.max() < 1.1 * size.speed_radps
+        if kind != FaultKind.ENCODER_REVERSED:  # which may leave a joint under gravity where it falls
+            assert speeds[-1] < 1e-3 * size.speed_radps
+        assert np.abs(run.log.measured_torque_Nm).max() < 1.1 * size.torque_Nm
