@@ -38,6 +38,7 @@ from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import (
+    TORQUE_MODES,
     CanopenSection,
     canopen_section,
     canopen_settings,
@@ -197,7 +198,7 @@ def _quick_stop(drive: CanopenSection, config: Config, settings: CanopenSettings
     of_loop, *of_limits = (radps2 for radps2, _ in needed_braking(settings))
     most = (config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)) / config.joint.inertia_kgm2
     usual = USUAL_RAMPS_radps2[index]
-    wanted = max(min(usual, most), *of_limits, 0.0 if drive.cascade is None else of_loop)
+    wanted = max(min(usual, most), *of_limits, 0.0 if drive.mode in TORQUE_MODES else of_loop)
     return None if wanted == usual else (index, wanted)
 
 

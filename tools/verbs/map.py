@@ -51,6 +51,7 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
     from jointctl.tools.sweeping.carry_out import with_mode, with_tracking_law
     from jointctl.tools.sweeping.plan import position_margin_rad
 
+    torque = with_tracking_law(with_mode(config, "torque"))  # refuses first: no limit helps in another mode
     limits = config.limits
     margin_rad = position_margin_rad(config)
     width_rad = limits.position_max_rad - limits.position_min_rad - 2.0 * margin_rad
@@ -80,7 +81,6 @@ def config_of_map(config: Config, options: MapOptions) -> Config:
         target_rad=middle + 0.5 * travel_rad, speed_radps=speed_radps, acceleration_radps2=acceleration,
         dwell_s=_DWELL_S, repeat=True,
     )  # fmt: skip
-    torque = with_tracking_law(with_mode(config, "torque"))
     return torque.changed(trajectory=motion)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jointctl.drivers.errors import UsageError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.gains import BELIEVED, choose_gains
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -114,6 +114,11 @@ def test_a_map_is_as_slow_as_the_joint(name: str, speed_radps: float) -> None:
 def test_a_joint_that_cannot_turn_its_motor_four_times_has_no_map(name: str) -> None:
     with pytest.raises(UsageError, match=r"position_min_rad and position_max_rad leave .* takes .* 4 motor turns"):
         config_of_map(joint(SIZES[name]), MapOptions())
+
+
+def test_a_map_in_another_mode_is_refused_for_the_mode_before_the_range() -> None:
+    with pytest.raises(ConfigurationError, match=r"drive.mode \(=csv\) must be cst, tq or auto"):
+        config_of_map(own_loop_joint(SIZES["direct drive"], "csv"), MapOptions())
 
 
 @pytest.mark.parametrize(("name", "stiff"), [("base", True), ("loaded base", True), ("short elbow", False)])

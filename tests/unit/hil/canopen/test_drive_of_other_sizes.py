@@ -17,6 +17,7 @@ from jointctl.hil.lockstep import TRUE_POSITION_rad
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
 from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import config_of_sweep
 from jointctl.tools.virtual_joint import new_device
 from tests.joint_sizes import SIZES, Size, own_loop_joint
 
@@ -53,6 +54,11 @@ def test_an_eds_beside_the_file_has_no_ramps_of_its_own(tmp_path: Path) -> None:
     shown = own_loop_joint(base, "csp", drive__eds=str(tmp_path / "own.eds"), encoder__side="motor")
     for name in ("quick_stop_deceleration", "profile_deceleration", "profile_acceleration"):
         assert ramp_radps2(shown, name) == pytest.approx(ramp_radps2(own_loop_joint(base, "csp"), name), rel=1e-3)
+
+
+def test_a_sweep_in_a_velocity_mode_has_the_ramp_of_a_run() -> None:
+    config = own_loop_joint(SIZES["finger"], "csp")
+    assert ramp_radps2(config_of_sweep(config, "csv")) == pytest.approx(ramp_radps2(config))
 
 
 def test_in_torque_mode_it_is_what_the_limits_need() -> None:
