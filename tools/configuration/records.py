@@ -106,7 +106,8 @@ def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
     axis.command_kind = config.drive.own_loop()
     record.position_gain_ps, record.lead_s = sent.position_gain_ps, sent.lead_s
     record.feeds_torque = int(sent.torque_offset)
-    record.acceleration_max_radps2 = config.limits.torque_max_Nm / config.joint.inertia_kgm2
+    left_Nm = config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)
+    record.acceleration_max_radps2 = left_Nm / config.joint.inertia_kgm2
     second = config.joint_encoder
     record.from_second = int(second is not None and second.law == "joint_encoder")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jointctl.drivers.canopen.cia import state_text
-from jointctl.drivers.errors import text_Nm
+from jointctl.drivers.errors import text_Nm, text_radps
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event
@@ -114,7 +114,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         follows_pause=True,
     ),
     Fault.VELOCITY_LIMIT: FaultWords(
-        "the joint moved at {value:.3f} rad/s, faster than limits.velocity_max_radps",
+        "the joint moved at {speed}, faster than limits.velocity_max_radps",
         "wrong sign of encoder or torque, or gains that the loop delay does not allow",
         "check encoder.direction and drive.torque_direction before the next run",
         follows_pause=True,
@@ -216,7 +216,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "ip -details link show, then bring the interface up again",
     ),
     Fault.STOP_TIMEOUT: FaultWords(
-        "the joint did not come to rest ({value:.3f} rad/s)",
+        "the joint did not come to rest ({speed})",
         "unstable gains or an outside torque",
         "lower the gains; look at the last seconds of the run log",
         own_loop=(
@@ -246,7 +246,7 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         follows_pause=True,
     ),
     Fault.NOT_AT_STANDSTILL: FaultWords(
-        "the joint moved at {value:.3f} rad/s before it was enabled",
+        "the joint moved at {speed} before it was enabled",
         "somebody moves it, or the encoder is noisy",
         "let it rest, or raise limits.standstill_radps",
     ),
@@ -332,7 +332,9 @@ def fault_text(
         text = FaultText(text.happened, *row.own_loop)
     if encoder_error and row.two_encoders:
         text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
-    happened = text.happened.format(value=value, torque=text_Nm(value), word=_word_text(value))
+    happened = text.happened.format(
+        value=value, torque=text_Nm(value), speed=text_radps(value, 3), word=_word_text(value)
+    )
     if drive_error:
         happened += f"; the drive's error code is {emergency_text(drive_error)}"
     if encoder_error == ENCODER_RESTARTED:
