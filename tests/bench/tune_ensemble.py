@@ -1,19 +1,20 @@
 """`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
 
-    python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft | --light] [--encoders both]
-                                       [--bits 17 20] [--noise COUNTS] [--bristles]
+    python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft | --light | --sizes]
+                                       [--encoders both] [--bits 17 20] [--noise COUNTS] [--bristles]
                                        [--workers 2] [--csv FILE] [--motions] [--cluster tls://HOST:8786]
 
 Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
-reducer and two encoders, or one of them, `--encoders`; `--light`: rigid, light, with much friction) begins with an
-inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no reducer, and the delay of the shipped
-configuration.  Simulated time.  The same law is chosen a second time from the true values, and both run
-0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s, and once more until 60 s, when what adapts
-has found its weights.  `--motions`: what was tuned also makes the runs of `flexible_study.py`, with learning and with
-adaptation, motions that never repeat.  `--bits`, `--noise`: of the encoder at the joint.  `--bristles`: no further than
-the step that measures how stiff they are; then motions with that stiffness and with the 8e4 Nm/rad of the shipped
-configurations, errors of the joint itself from 20 to 50 s: up to 16 bit with the Kalman filter of docs/law.md, with
-and without adaptation, above with the gains that are chosen, adaptation and pairing.
+reducer and two encoders, or one of them, `--encoders`; `--light`: rigid, light, with much friction; `--sizes`: rigid,
+from a finger to a base joint) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the
+same, no reducer, and the delay of the shipped configuration.  Simulated time.  The same law is chosen a second time
+from the true values, and both run 0.35 sin(0.2 pi t), with `--sizes` a sine that suits the joint; the error is that of
+the link itself from 20 s to 40 s, and once more until 60 s, when what adapts has found its weights.  `--motions`: what
+was tuned also makes the runs of `flexible_study.py`, with learning and with adaptation, motions that never repeat.
+`--bits`, `--noise`: of the encoder at the joint.  `--bristles`: no further than the step that measures how stiff they
+are; then motions with that stiffness and with the 8e4 Nm/rad of the shipped configurations, errors of the joint itself
+from 20 to 50 s: up to 16 bit with the Kalman filter of docs/law.md, with and without adaptation, above with the gains
+that are chosen, adaptation and pairing.
 
 Hysteresis leaves a reducer no single stiffness.  The one that is compared is what the virtual reducer did in the
 response itself: its torque over its twist, both of the simulation and by the lines of the excitation, as the analysis
@@ -78,6 +79,8 @@ from jointctl.tools.verbs import tune_steps  # noqa: E402
 from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import STEPS, Tune  # noqa: E402
 from tests.bench.flexible_study import ADAPTATION, Row, runs_of, table  # noqa: E402
+from tests.joint_sizes import Size  # noqa: E402
+from tests.joint_sizes import joint as joint_of  # noqa: E402
 
 RUN_s, FROM_s, LATE_s = 60.0, 20.0, 40.0
 SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
@@ -263,6 +266,36 @@ def unloaded(plant: Config, seed: int, index: int) -> Config:
     return plant.changed(joint__inertia_kgm2=inertia, friction=scaled(plant.friction, factor, factor))
 
 
+def of_any_size(seed: int, index: int) -> Config:
+    """A rigid joint of 0.3 to 1000 Nm, with 4 to 40 % of friction, 16 to 22 bit, at 250 Hz to 1 kHz."""
+    random = np.random.default_rng([seed, index, 77])
+
+    def between(low: float, high: float) -> float:
+        return math.exp(random.uniform(math.log(low), math.log(high)))
+
+    torque_Nm = between(0.3, 1000.0)
+    inertia_kgm2 = torque_Nm / (between(4.0, 600.0) * (60.0 / torque_Nm) ** 0.25)
+    friction_Nm, gravity = between(0.04, 0.4) * torque_Nm, float(random.choice([0.0, 0.0, random.uniform(0.1, 0.45)]))
+    rate_Hz, bits = float(random.choice([1000.0, 1000.0, 1000.0, 500.0, 250.0])), int(random.integers(16, 23))
+    ratio, speed_radps, travel_rad = (
+        float(random.choice([5.0, 10.0, 50.0, 100.0, 160.0])),
+        between(0.3, 12.0),
+        between(0.3, 3.0),
+    )
+    size = Size(
+        torque_Nm, inertia_kgm2, ratio, friction_Nm, speed_radps, travel_rad, bits, rate_Hz, gravity * torque_Nm
+    )
+    delay_s = random.uniform(0.5e-3, 2e-3) if rate_Hz >= 1000.0 else random.uniform(0.5, 1.5) / rate_Hz
+    return joint_of(
+        size,
+        virtual__friction_kind=str(random.choice(["lugre", "lugre", "lugre", "stick_slip"])),
+        virtual__command_delay_s=float(delay_s), virtual__current_lag_s=random.uniform(0.3e-3, 1e-3),
+        virtual__friction_positive_scale=random.uniform(0.9, 1.1),
+        virtual__friction_negative_scale=random.uniform(0.9, 1.1),
+        virtual__current_limit_A=min(100.0 * torque_Nm / ratio, 9000.0),
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Task:
     """One joint; it is sent to a process."""
@@ -342,6 +375,8 @@ def tuned(task: Task) -> dict[str, Any]:
     plant = random_plant(base, settings, seed, index).changed(virtual__encoder_noise_counts=task.noise_counts)
     if kind == "light":
         plant = unloaded(plant, seed, index)
+    elif kind == "sizes":
+        plant = of_any_size(seed, index)
     if encoders == "motor":
         plant = plant.changed(joint_encoder=None)
     true_kgm2 = plant.joint.inertia_kgm2 * plant.virtual.inertia_scale
@@ -370,7 +405,8 @@ def tuned(task: Task) -> dict[str, Any]:
     row["inertia"] = fit.inertia_kgm2.value / true_kgm2 - 1.0
     row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
     row["late_ms_half"] = 1e3 * fit.late_s.half
-    row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
+    period_s = 1.0 / plant.loop.rate_Hz if kind == "sizes" else 0.0  # which a synchronous RPDO takes
+    row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s - period_s)
     local = (0.0, 0.0, 0.0)
     if encoders == "link":  # which tells neither the twist nor the two inertias apart
         stiffness, damping = SMALL_MOTION * virtual.reducer_stiffness_Nmprad, fit.damping_Nmspr.value
@@ -463,7 +499,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=90701)
     parser.add_argument("--plants", type=int, default=40)
     kinds = parser.add_mutually_exclusive_group()
-    for kind in ("soft", "light"):
+    for kind in ("soft", "light", "sizes"):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, default="rigid")
     parser.add_argument("--encoders", choices=tuple(LAWS), default="both", help="of a soft joint; default: both")
     parser.add_argument("--motions", action="store_true")

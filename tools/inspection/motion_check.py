@@ -359,7 +359,7 @@ def _break_away_Nm(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -
 def _slide(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> tuple[float, float]:
     """Friction [Nm] and inertia [kg m^2] of the first slide, until it is slow again: J q'' = u - F, summed up twice.
 
-    The inertia is 0 where they cannot be told; that of the file may be many times wrong.
+    The inertia is 0 where neither is seen; that of the file may be many times wrong.
     """
     begin = int(np.argmax(np.abs(way) >= BEGUN * abs(way[first])))
     speed = np.asarray(rows.velocity_radps[begin:]) * np.sign(way[first])
