@@ -70,7 +70,11 @@ class TooWeak(MotionFault):
 
 
 class TooStiff(MotionFault):
-    """A joint that swung, fast or pushed hard: its torque is later than is known yet, or its reducer softer."""
+    """A joint that swung fast: its torque is later than is known yet, or its reducer softer."""
+
+
+class Pushed(TooStiff):
+    """A joint that swung slowly, pushed hard: it may be against something, and no stiffer law may follow."""
 
 
 class NotCarriedOut(Exception):
@@ -433,7 +437,8 @@ def response_by_any_law(
             if law not in _MUCH_FRICTION[:2] or FED not in others:
                 raise
             carrier.output.note(f"  {error.message}: once more, {FED}")
-            return by(FED, *(other for other in others if other == FED_STIFFEST))  # it may have stuck and slid as fast
+            stiffest = FED_STIFFEST in others and not isinstance(error, Pushed)  # it may have stuck and slid as fast
+            return by(FED, *([FED_STIFFEST] if stiffest else []))
         return by(*others)
 
     return by(*laws)
@@ -530,7 +535,9 @@ def _stage(
             ended = _ended(title, carried)
             if _too_weak(task.config, carried, peak_Nm):
                 raise TooWeak(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
-            raise TooStiff(ended.message, ended.hint) if carried.fault == Fault.LIMIT_CYCLE else ended
+            if carried.fault == Fault.LIMIT_CYCLE:
+                raise (TooStiff if carried.value >= HUNTING_Hz else Pushed)(ended.message, ended.hint)
+            raise ended
         return carried.records
 
     records = moved()
