@@ -292,7 +292,7 @@ def of_any_size(seed: int, index: int) -> Config:
         virtual__command_delay_s=float(delay_s), virtual__current_lag_s=random.uniform(0.3e-3, 1e-3),
         virtual__friction_positive_scale=random.uniform(0.9, 1.1),
         virtual__friction_negative_scale=random.uniform(0.9, 1.1),
-        virtual__current_limit_A=min(100.0 * torque_Nm / ratio, 9000.0),
+        virtual__current_limit_A=min(100.0 * torque_Nm / ratio, 9000.0), sequence__stop_timeout_s=10.0,
     )  # fmt: skip
 
 
