@@ -268,7 +268,8 @@ def test_a_reading_that_stood_with_the_old_gains_is_looked_at_again(
     """A friction of the file that is too large throws a light joint, which then stands; an encoder may be dead too."""
     runs: list[str] = []
 
-    def verified(_: Tune, __: Config, title: str) -> dict[str, Any]:
+    def verified(self: Tune, config: Config, title: str) -> dict[str, Any]:
+        assert (config is self.config) is (title != "the same before")
         runs.append(title)
         if dead and runs[1:] and title != "the same before":
             raise MotionFault("verification once more: POSITION_FROZEN", "")

@@ -224,11 +224,12 @@ def _swing_contradiction(config: Config) -> list[str]:
     if swing_rad >= LEAST_STEPS * step_rad:
         return []
     share = math.ceil(100.0 * LEAST_STEPS * step_rad / limits.following_error_max_rad) / 100.0
+    remedy = f"a share of {share:g} is" if share <= 1.0 else f"{LEAST_STEPS * step_rad:.2g} rad of error are"
     return [
         f"limits.swing_error_share (={limits.swing_error_share:g}) of following_error_max_rad "
         f"(={limits.following_error_max_rad:g}) is {1e3 * swing_rad:.3g} mrad, and a count of the encoder "
-        f"{1e3 * step_rad:.3g} mrad: its steps alone look like an error that swings (LIMIT_CYCLE); a share of "
-        f"{share:g} is {LEAST_STEPS:g} counts"
+        f"{1e3 * step_rad:.3g} mrad: its steps alone look like an error that swings (LIMIT_CYCLE); "
+        f"{remedy} {LEAST_STEPS:g} counts"
     ]
 
 

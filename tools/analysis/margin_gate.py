@@ -270,12 +270,8 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
 
 
 def chatters(config: Config) -> bool:
-    """Whether the gate refuses the loop for one count of an encoder."""
-    try:
-        refuse_chatter(config, loop_settings(config)[0])
-    except MarginError:
-        return True
-    return False
+    """Whether one count of an encoder takes what friction and gravity leave of the torque, if they leave any."""
+    return 0.0 < free_torque_Nm(config) <= coarsest(config, loop_settings(config)[0])[0]
 
 
 def meets(found: Margins, minimum_deg: float) -> bool:

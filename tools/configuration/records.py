@@ -107,7 +107,8 @@ def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
     record.position_gain_ps, record.lead_s = sent.position_gain_ps, sent.lead_s
     record.feeds_torque = int(sent.torque_offset)
     left_Nm = config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)
-    record.acceleration_max_radps2 = left_Nm / config.joint.inertia_kgm2
+    # no less than a stop is planned with: a target that fell behind it would go on beyond the limits of position
+    record.acceleration_max_radps2 = max(left_Nm / config.joint.inertia_kgm2, config.sequence.brake_radps2)
     second = config.joint_encoder
     record.from_second = int(second is not None and second.law == "joint_encoder")
 

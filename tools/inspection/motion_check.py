@@ -311,7 +311,7 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
 
 
 def motion_of(records: np.recarray, threshold_rad: float, held_cycles: int) -> Motion | None:
-    """None if the drive was never enabled; without `inertia_kgm2`, the most it may be, no joint is a heavy one."""
+    """None if the drive was never enabled."""
     rows: Any = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
     powered = np.isin(rows.phase, _POWERED)
     if powered.sum() < 2:
@@ -365,6 +365,7 @@ def _slide(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> tuple[
     speed = np.asarray(rows.velocity_radps[begin:]) * np.sign(way[first])
     slow = speed < SLOW_AGAIN * np.maximum.accumulate(speed)
     slow[: first - begin + 1] = False
+    slow |= ~np.isin(rows.phase[begin:], _POWERED)  # the drive's own ramp, which no row says
     slide = slice(begin, begin + int(np.argmax(slow)) if slow.any() else len(way))
     time_s = (rows.time_ns[slide] - rows.time_ns[begin]) * 1e-9
     step_s = np.diff(time_s, prepend=0.0)

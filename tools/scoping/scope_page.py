@@ -206,7 +206,6 @@ class StartPanel:
 
 # --- what may be changed while it moves: set-point, trajectory, gains; and the recording ---
 
-# kind -> key -> (label, first value)
 KINDS = ("configured", "sine", "min_jerk", "trapezoid")
 SPEED_SHARE = 0.25  # of limits.velocity_max_radps, at most, of a motion that is offered
 PEAK_OF_MIN_JERK = 1.9  # its greatest speed over the mean one, rounded up
@@ -219,17 +218,18 @@ def offered(kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
     low, high = settings["range"]
     size = min(0.1, 0.15 * (high - low))
     middle = 0.0 if low + size <= 0.0 <= high - size else 0.5 * (low + high)
-    speed = SPEED_SHARE * settings["velocity_max_radps"]
+    speed, brake = SPEED_SHARE * settings["velocity_max_radps"], 0.5 * settings["brake_radps2"]
+    quickest_radps = min(speed / size, math.sqrt(brake / size))  # of the sine
+    move_s = max(2.0, PEAK_OF_MIN_JERK * size / speed, 2.5 * math.sqrt(size / brake))
     move = {"start_rad": middle, "target_rad": middle + size}
     values = {
-        "sine": {"amplitude_rad": size, "frequency_Hz": min(0.2, speed / (math.tau * size)), "offset_rad": middle},
-        "min_jerk": {**move, "move_s": max(2.0, PEAK_OF_MIN_JERK * size / speed), "dwell_s": 0.5},
+        "sine": {"amplitude_rad": size, "frequency_Hz": min(0.2, quickest_radps / math.tau), "offset_rad": middle},
+        "min_jerk": {**move, "move_s": move_s, "dwell_s": 0.5},
         "trapezoid": {
-            **move, "speed_radps": min(0.1, speed),
-            "acceleration_radps2": min(0.5, 0.5 * settings["brake_radps2"]), "dwell_s": 0.5,
+            **move, "speed_radps": min(0.1, speed), "acceleration_radps2": min(0.5, brake), "dwell_s": 0.5,
         },
     }  # fmt: skip
-    return {key: round(value, 4) for key, value in values.get(kind, {}).items()}
+    return {key: float(f"{value:.4g}") for key, value in values.get(kind, {}).items()}
 
 
 ENDLESS = "a set-point, sine, move or trapezoid goes on until it is stopped; the configured motion ends by itself"
