@@ -375,6 +375,12 @@ def spline_table(time_s: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
     raise ValueError(f"the smallest time step (={closest:g} s) must be longer, no spline can be computed")
 
 
+def quintic_s(way_rad: float, speed_radps: float, acceleration_radps2: float) -> float:
+    """Of a quintic of least jerk from rest to rest that keeps to both."""
+    of_acceleration_s = math.sqrt(QUINTIC_PEAK_ACCELERATION * way_rad / acceleration_radps2)
+    return max(QUINTIC_PEAK_SPEED * way_rad / speed_radps, of_acceleration_s)
+
+
 def eased(share: np.ndarray) -> np.ndarray:
     """0 to 1 with continuous acceleration, and rest outside: the quintic of a move."""
     u = np.clip(share, 0.0, 1.0)

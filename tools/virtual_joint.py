@@ -47,7 +47,12 @@ from jointctl.tools.configuration.canopen import (
     torque_limit_object,
 )
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, first_on_bus, raise_if
-from jointctl.tools.configuration.conversions import friction_constants, static_frictions_Nm, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import (
+    acceleration_beside_gravity_radps2,
+    friction_constants,
+    static_frictions_Nm,
+    torque_constant_NmpA,
+)
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
 
 if TYPE_CHECKING:
@@ -196,7 +201,7 @@ def _quick_stop(drive: CanopenSection, config: Config, settings: CanopenSettings
     if not index:
         return None
     of_loop, *of_limits = (radps2 for radps2, _ in needed_braking(settings))
-    most = (config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)) / config.joint.inertia_kgm2
+    most = acceleration_beside_gravity_radps2(config)
     usual = USUAL_RAMPS_radps2[index]
     wanted = max(min(usual, most), *of_limits, 0.0 if drive.mode in TORQUE_MODES else of_loop)
     return None if wanted == usual else (index, wanted)

@@ -19,7 +19,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmFeedForward, ArmLink, ArmMotion, JointKind
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED
+from jointctl.firmware_py.trajectory import quintic_s
 from jointctl.tools.configuration.canopen import TORQUE_WANTED, CanopenSection, canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_line, problem_lines, raise_if
@@ -96,10 +96,7 @@ def shortest_move_s(configs: tuple[Config, ...], way_rad: tuple[float, ...]) -> 
     for config, way in zip(configs, way_rad, strict=True):
         speed = SPEED_SHARE * config.limits.velocity_max_radps
         acceleration = TORQUE_SHARE * config.limits.torque_max_Nm / config.joint.inertia_kgm2
-        longest = max(
-            longest, QUINTIC_PEAK_SPEED * abs(way) / speed,
-            math.sqrt(QUINTIC_PEAK_ACCELERATION * abs(way) / acceleration),
-        )  # fmt: skip
+        longest = max(longest, quintic_s(abs(way), speed, acceleration))
     return math.ceil(min(longest, LONGEST_MOVE_s) * 1e3) * 1e-3
 
 

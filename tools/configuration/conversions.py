@@ -81,6 +81,11 @@ def link_period_s(config: Config, reducer: Reducer) -> float:
     return math.tau * math.sqrt(config.margin.payload_range[1] * config.link_kgm2 / reducer.stiffness_Nmprad)
 
 
+def acceleration_beside_gravity_radps2(config: Config) -> float:
+    """With the torque that gravity leaves; friction may help to brake, and is left out."""
+    return (config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)) / config.joint.inertia_kgm2
+
+
 def turning_of(config: Config, acceleration_radps2: float) -> tuple[float, float]:
     """(acceleration, time in which it changes) of a motion that measures, which may have that acceleration.
 

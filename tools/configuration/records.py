@@ -42,6 +42,7 @@ from jointctl.firmware_py.trajectory import approach_duration_s, approach_start,
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Adaptation, Config, Control, raise_if
 from jointctl.tools.configuration.conversions import (
+    acceleration_beside_gravity_radps2,
     fill_series,
     friction_constants,
     law_resolution_rad,
@@ -106,9 +107,8 @@ def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
     axis.command_kind = config.drive.own_loop()
     record.position_gain_ps, record.lead_s = sent.position_gain_ps, sent.lead_s
     record.feeds_torque = int(sent.torque_offset)
-    left_Nm = config.limits.torque_max_Nm - abs(config.joint.gravity_Nm)
     # no less than a stop is planned with: a target that fell behind it would go on beyond the limits of position
-    record.acceleration_max_radps2 = max(left_Nm / config.joint.inertia_kgm2, config.sequence.brake_radps2)
+    record.acceleration_max_radps2 = max(acceleration_beside_gravity_radps2(config), config.sequence.brake_radps2)
     second = config.joint_encoder
     record.from_second = int(second is not None and second.law == "joint_encoder")
 

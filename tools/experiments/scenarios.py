@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
-from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, eased, spline_table
+from jointctl.firmware_py.trajectory import eased, quintic_s, spline_table
 from jointctl.hil.lockstep import TRUE_POSITION_rad
 from jointctl.tools.analysis.gains import gains_of_file
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -119,9 +119,7 @@ def _point_to_point(random: np.random.Generator, duration_s: float) -> tuple[np.
         target = random.uniform(-REACH_rad, REACH_rad)
         size = abs(target - place)
         slowness = random.uniform(1.0, 3.0)
-        move_s = slowness * max(
-            QUINTIC_PEAK_SPEED * size / SPEED_radps, math.sqrt(QUINTIC_PEAK_ACCELERATION * size / ACCELERATION_radps2)
-        )
+        move_s = slowness * quintic_s(size, SPEED_radps, ACCELERATION_radps2)
         rest_s = random.uniform(0.4, 1.0)
         # on rows, so that the spline has no corner between two
         end_s = round((now_s + move_s) / _ROW_S) * _ROW_S

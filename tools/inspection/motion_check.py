@@ -362,19 +362,18 @@ def _slide(rows: Any, way: np.ndarray, pushed: np.ndarray, first: int) -> tuple[
     The inertia is 0 where neither is seen; that of the file may be many times wrong.
     """
     begin = int(np.argmax(np.abs(way) >= BEGUN * abs(way[first])))
-    speed = np.asarray(rows.velocity_radps[begin:]) * np.sign(way[first])
+    sign = np.sign(way[first])
+    speed = np.asarray(rows.velocity_radps[begin:]) * sign
     slow = speed < SLOW_AGAIN * np.maximum.accumulate(speed)
     slow[: first - begin + 1] = False
     slow |= ~np.isin(rows.phase[begin:], _POWERED)  # the drive's own ramp, which no row says
     slide = slice(begin, begin + int(np.argmax(slow)) if slow.any() else len(way))
     time_s = (rows.time_ns[slide] - rows.time_ns[begin]) * 1e-9
     step_s = np.diff(time_s, prepend=0.0)
-    acting = np.roll(pushed, ACTS_CYCLES)[slide] * np.sign(way[first])
+    acting = np.roll(pushed, ACTS_CYCLES)[slide] * sign
     twice = np.cumsum(np.cumsum(acting * step_s) * step_s)
     columns = np.column_stack((twice, 0.5 * time_s**2, time_s, np.ones(len(time_s))))
-    per_Nm, per_s2, *_ = (
-        float(one) for one in np.linalg.lstsq(columns, way[slide] * np.sign(way[first]), rcond=None)[0]
-    )
+    per_Nm, per_s2 = (float(one) for one in np.linalg.lstsq(columns, way[slide] * sign, rcond=None)[0][:2])
     return (-per_s2 / per_Nm, 1.0 / per_Nm) if per_Nm > 0.0 else (0.0, 0.0)
 
 

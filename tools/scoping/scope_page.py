@@ -14,6 +14,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from jointctl.firmware_py.states import AxisPhase
+from jointctl.firmware_py.trajectory import quintic_s
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.scoping.chart import Chart
 from jointctl.tools.scoping.feed import LATE_S, OVER, ScopeOrder
@@ -208,7 +209,6 @@ class StartPanel:
 
 KINDS = ("configured", "sine", "min_jerk", "trapezoid")
 SPEED_SHARE = 0.25  # of limits.velocity_max_radps, at most, of a motion that is offered
-PEAK_OF_MIN_JERK = 1.9  # its greatest speed over the mean one, rounded up
 
 
 def offered(kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
@@ -220,7 +220,7 @@ def offered(kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
     middle = 0.0 if low + size <= 0.0 <= high - size else 0.5 * (low + high)
     speed, brake = SPEED_SHARE * settings["velocity_max_radps"], 0.5 * settings["brake_radps2"]
     quickest_radps = min(speed / size, math.sqrt(brake / size))  # of the sine
-    move_s = max(2.0, PEAK_OF_MIN_JERK * size / speed, 2.5 * math.sqrt(size / brake))
+    move_s = max(2.0, quintic_s(size, speed, brake))
     move = {"start_rad": middle, "target_rad": middle + size}
     values = {
         "sine": {"amplitude_rad": size, "frequency_Hz": min(0.2, quickest_radps / math.tau), "offset_rad": middle},

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
-from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, peak_of
+from jointctl.firmware_py.trajectory import peak_of, quintic_s
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.gains import BELIEVED, Intervals, latest_s
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -218,7 +217,7 @@ def verifying_motion(config: Config) -> Trajectory:
     except (ConfigurationError, MotionFault):
         low, high, speed, acceleration = peak_of(trajectory_constants(config, table), table)
         way = high - low
-        move_s = max(QUINTIC_PEAK_SPEED * way / speed, math.sqrt(QUINTIC_PEAK_ACCELERATION * way / acceleration))
+        move_s = quintic_s(way, speed, acceleration)
         return MinJerk(
             kind="min_jerk", duration_s=seconds, start_rad=low, target_rad=high, move_s=move_s, repeat=True
         )  # fmt: skip
