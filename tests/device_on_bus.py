@@ -27,6 +27,18 @@ PASS_TIME, TIME_PASSED = 0x1FFFFFF0, 0x1FFFFFF1  # extended identifiers: no fram
 network.NOTIFIER_S = 0.005  # a receiving thread is waited for whenever a driver is closed
 
 
+@contextmanager
+def sent_every_10_ms(interface: str, channel: str, identifier: int, data: bytes = b"") -> Iterator[None]:
+    """A frame of another program, again and again; the thread that sends has ended when its bus is closed."""
+    with can.Bus(interface=interface, channel=channel) as bus:
+        sender = bus.send_periodic(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), 0.01)
+        try:
+            yield
+        finally:
+            sender.stop()
+            sender.thread.join()
+
+
 def pass_time(seconds: float) -> can.Message:
     return can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds))
 

@@ -16,6 +16,7 @@ from jointctl.drivers import stop_note
 from jointctl.drivers.bus_lock import lock_name
 from jointctl.drivers.canopen.cia import SYNC_ID, ControlWord
 from jointctl.firmware_py.states import Fault
+from tests.device_on_bus import sent_every_10_ms
 from tests.hil.terminal import Terminal
 
 SDO_REQUEST = 0x601  # to node 1
@@ -167,10 +168,8 @@ def test_sync_of_another_controller_ends_a_run_and_is_named(bench: Any) -> None:
     """The drive takes its torque and samples at every SYNC, whoever sends it."""
     config = bench.with_joint(trajectory__duration_s=30.0)
     run = bench.start("run", config, "-y").saw("  tracking")
-    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
-        sender = foreign.send_periodic(can.Message(arbitration_id=SYNC_ID, is_extended_id=False), 0.01)
+    with sent_every_10_ms("jointctl", bench.channel, SYNC_ID):
         done = run.finished(20.0)
-        sender.stop()
     done.refused(7, "another controller is active on this bus: ", "x SYNC")
     assert bench.disabled()
 
@@ -179,19 +178,15 @@ def test_heartbeats_that_would_feed_the_drives_watchdog_for_us_end_a_run_and_are
     """With them a drive without 1400:5 kept its torque when both programs had died."""
     config = bench.with_joint(trajectory__duration_s=30.0)
     run = bench.start("run", config, "-y").saw("  tracking")
-    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
-        sender = foreign.send_periodic(can.Message(arbitration_id=0x77E, data=b"\5", is_extended_id=False), 0.01)
+    with sent_every_10_ms("jointctl", bench.channel, 0x77E, b"\5"):
         done = run.finished(20.0)
-        sender.stop()
     done.refused(7, "another controller is active on this bus: ", "x heartbeat of node 126, which is our own")
     assert bench.disabled()
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
     config = bench.with_joint()
-    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
-        sender = foreign.send_periodic(can.Message(arbitration_id=SYNC_ID, is_extended_id=False), 0.01)
+    with sent_every_10_ms("jointctl", bench.channel, SYNC_ID):
         for verb in (("run", "-y"), ("clear-fault",)):
             bench.run(*verb, config).refused(4, "another controller", "SYNC")
-        sender.stop()
     assert bench.disabled()

@@ -33,6 +33,7 @@ from jointctl.tools.verbs.info import node_info as info
 from jointctl.tools.verbs.monitor import MonitorOptions, Selection, selection_of
 from jointctl.tools.verbs.monitor import monitor_bus as monitor
 from jointctl.tools.verbs.scan import scan
+from tests.device_on_bus import sent_every_10_ms
 from tests.sessions import output
 
 SDO_READ = (0x40, 0x60, 0x70)  # initiate upload, upload segment with either toggle bit
@@ -74,11 +75,8 @@ class TestScan:
     @pytest.mark.parametrize("active", [True, False])
     def test_beside_a_controller_its_heartbeat_is_explained(self, joint: Any, active: bool) -> None:
         told, _, err = output()
-        with can.Bus(interface="virtual", channel=joint.channel) as bus:
-            identifier = 0x80 if active else 0x7E5
-            sender = bus.send_periodic(can.Message(arbitration_id=identifier, is_extended_id=False), 0.01)
+        with sent_every_10_ms("virtual", joint.channel, 0x80 if active else 0x7E5):
             assert scan(subject(joint, 1), told, listen_s=0.3) == 0
-            sender.stop()
         assert ("may be the heartbeat of that controller" in err.getvalue()) is active
 
     def test_passive_sends_nothing_and_hears_heartbeats(self, joint: Any) -> None:
@@ -220,10 +218,8 @@ class TestInfo:
 class TestMonitor:
     def test_listens_only(self, joint: Any) -> None:
         told, out, err = output(json=True)
-        with can.Bus(interface="virtual", channel=joint.channel) as bus:
-            sender = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
+        with sent_every_10_ms("virtual", joint.channel, 0x80):
             assert monitor(subject(joint), told, Selection(count=3, kinds=frozenset({"sync"}))) == 0
-            sender.stop()
         lines = [json.loads(line) for line in out.getvalue().splitlines()]
         assert [line["kind"] for line in lines] == ["sync"] * 3
         assert {identifier for identifier, _ in joint.requests} == {0x80}

@@ -35,6 +35,7 @@ from jointctl.tools.inspection.parameters import (
 )
 from jointctl.tools.inspection.subject import ATTEMPTS, SdoReader, Subject, canopen_network, new_dictionary
 from jointctl.tools.verbs.params import DIFFERENT, _require_off, diff, dump, place_index, restore_file
+from tests.device_on_bus import sent_every_10_ms
 from tests.sessions import Terminal, output
 
 # --- Subject and output of the verb params, and a DCF that is changed ---
@@ -358,11 +359,11 @@ class TestRestore:
 
     def test_another_controller_is_left_alone(self, joint: Any, file: Path) -> None:
         change(file, o6072="700")
-        with can.Bus(interface="virtual", channel=joint.channel) as bus:
-            sender = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
-            with pytest.raises(BusError, match="another controller"):
-                restored(joint, file)
-            sender.stop()
+        with (
+            sent_every_10_ms("virtual", joint.channel, 0x80),
+            pytest.raises(BusError, match="another controller"),
+        ):
+            restored(joint, file)
         assert not writes(joint)
 
     @pytest.mark.parametrize("other", [True, False])
