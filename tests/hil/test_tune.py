@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ from jointctl.tools.verbs.tune_steps import Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.bench.tune_ensemble import scaled
 from tests.configurations import written
+from tests.joint_sizes import Size, joint
 from tests.page_figures import foreign_colours, svgs
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -287,6 +289,66 @@ def test_a_reading_that_stood_with_the_old_gains_is_looked_at_again(
     else:
         assert job._step_verification()["before"] == {"fault": "POSITION_FROZEN"}
     assert runs == ["verification", "the same before", "verification once more"]
+
+
+def test_a_joint_that_learning_makes_worse_is_tuned_without_it(tmp_path: Path) -> None:
+    """Its friction stops it within a few milliseconds, at other places in every period."""
+    size = Size(4.2, 0.0086, 5.0, 0.31, 1.1, 0.34, 17)
+    true = joint(size, virtual__command_delay_s=0.8e-3, virtual__current_lag_s=0.7e-3)
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    believed = true.changed(joint__inertia_kgm2=0.55 * 0.0086, virtual__inertia_scale=1.0 / 0.55)
+    job = Tune(believed, TuneOptions(lockstep=True), carrier, tmp_path)
+    job.carry_out()
+    assert re.search(r"learning is left out: with it the error that repeats was 1\.\d\d times that of", err.getvalue())
+    assert job.config.control.learning is None
+    assert "learning" not in job.state["gains"]["control"]
+    after = job.state["verification"]["after"]
+    assert job.gains is not None
+    with_learning = job._verified(job._with_control(job.gains.control), "verification")
+    assert after["rmse_mrad"] < 0.8 * with_learning["rmse_mrad"]
+
+
+SWINGS = LimitCycle("verification: LIMIT_CYCLE (27): torque swung", "lower the gains")
+
+
+@pytest.mark.parametrize(
+    ("learns", "outcome", "left_out"),
+    [
+        (True, {"rmse_mrad": 0.1, "learning": 0.99}, None),
+        (True, {"rmse_mrad": 0.1, "learning": None}, None),
+        (True, {"rmse_mrad": 0.1, "learning": 1.01}, "the error that repeats was 1.01 times that of"),
+        (True, SWINGS, "verification: LIMIT_CYCLE (27): torque swung"),
+        (False, SWINGS, None),
+    ],
+)
+def test_learning_that_does_not_help_is_left_out_and_what_remains_is_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learns: bool, outcome: Any, left_out: str | None
+) -> None:
+    runs: list[bool] = []
+
+    def verified(_: Tune, config: Config, title: str) -> dict[str, Any]:
+        runs.append(config.control.learning is not None)
+        if title == "verification" and isinstance(outcome, Exception):
+            raise outcome
+        return dict(outcome) if title == "verification" else {"rmse_mrad": 0.2, "learning": None}
+
+    monkeypatch.setattr(Tune, "_verified", verified)
+    output, _, err = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    config = load_config(shipped_config("precise"))
+    job = Tune(config if learns else config.changed(control__learning=None), TuneOptions(), carrier, tmp_path)
+    job.state["gains"] = {"control": {"learning": {}}}
+    if not learns:
+        with pytest.raises(LimitCycle):
+            job._verified_with_what_helps()
+        assert runs == [False]
+        return
+    found = job._verified_with_what_helps()
+    assert found["rmse_mrad"] == (0.1 if left_out is None else 0.2)
+    assert runs == ([True] if left_out is None else [True, False])
+    assert (job.config.control.learning is None) is ("learning" not in job.state["gains"]["control"]) is bool(left_out)
+    assert f"warning: iterative learning is left out: with it {left_out}" in err.getvalue() or left_out is None
 
 
 def test_a_law_that_is_none_of_the_file_is_no_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -539,8 +601,13 @@ def test_gains_that_measure_better_bring_their_own_margins(
     tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tuned.ended_before_its_gains(tmp_path)
-    errors = iter(0.1 * 0.5**k for k in range(20))
-    monkeypatch.setattr(Tune, "_verified", lambda *_: {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1})
+    errors, learning = iter(0.1 * 0.5**k for k in range(20)), list[bool]()
+
+    def verified(_: Tune, config: Config, title: str) -> dict[str, Any]:
+        learning.append(config.control.learning is not None)
+        return {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1, "learning": 1.1}
+
+    monkeypatch.setattr(Tune, "_verified", verified)
     output, *_ = outputs()
     carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
     options = TuneOptions(lockstep=True, refine=True, resume=True)
@@ -549,6 +616,8 @@ def test_gains_that_measure_better_bring_their_own_margins(
     gains, kept = job.gains, job.state["gains"]
     assert gains is not None
     assert len(job.state["refinement"]["runs"]) > 1
+    assert learning[0]
+    assert not any(learning[1:])  # nor has the file as it was
     assert kept["control"]["kv"] == job.config.control.kv == gains.best.settings.kv
     assert kept["control"]["kv"] == job.state["refinement"]["runs"][-1]["kv"]
     assert kept["phase_margin_deg"] == gains.best.phase_margin_deg

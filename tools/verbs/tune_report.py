@@ -71,7 +71,9 @@ def values_of(job: Tune) -> list[Found]:
             values.append(Found(("control",), key, value[0] if key == "lyapunov_q" else value, source))
     if before["learning"] != after["learning"]:
         if after["learning"] is None:
-            values.append(Found(("control",), "learning", None, "none: it would not converge, or the law has none"))
+            values.append(
+                Found(("control",), "learning", None, "none: it would not converge, does not help, or the law has none")
+            )
         for key, value in (after["learning"] or {}).items():
             values.append(Found(("control", "learning"), key, value, ""))
     if before["adaptation"] != after["adaptation"]:

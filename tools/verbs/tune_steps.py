@@ -15,8 +15,6 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jointctl.drivers.errors import (
     ConfigurationError,
     DataError,
@@ -68,14 +66,13 @@ from jointctl.tools.tuning.carry_out import (
     NotCarriedOut,
     SLOW_OBSERVER_radps,
     TooWeak,
-    VerifyingMotion,
     require_one_joint,
     require_same_joint,
     response_by_any_law,
     response_task,
     task_by,
+    verified,
     verifying_motion,
-    with_motion,
     with_slow_observer,
 )
 from jointctl.tools.tuning.frequency_response import (
@@ -106,7 +103,6 @@ SOFTER = ("the step pulls with a law of its own, as stiff as the static friction
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_POINTS, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 0.5, 0.1
 SWEEP_RATIOS = (100.0, 25.0, 8.0)  # of the fastest plateau to the slowest: the next where the slow ones swing
-VERIFY_FROM_s = 5.0
 WORSE = 1.5  # times the error with the gains as they were
 REFINE_RUNS = 4
 REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
@@ -498,7 +494,7 @@ class Tune:
     # --- 8. the run that shows it ---
 
     def _step_verification(self) -> dict[str, Any]:
-        found = {"after": self._verified(self.config, "verification")}
+        found = {"after": self._verified_with_what_helps()}
         self._require_same_joint("after the verification")
         before = self._before()
         try:
@@ -510,6 +506,24 @@ class Tune:
         if found["before"].get("fault") == Fault.POSITION_FROZEN.name:  # by a wrong friction, or by a dead encoder
             self._verified(self.config, "verification once more")
         return found
+
+    def _verified_with_what_helps(self) -> dict[str, Any]:
+        """Of the new gains; once more, and for good, without learning where it does not make the error smaller."""
+        try:
+            found = self._verified(self.config, "verification")
+            factor = found.get("learning")
+            if factor is None or factor < 1.0:
+                return found
+            harm = f"the error that repeats was {factor:.2f} times that of the first period"
+        except LimitCycle as error:
+            if self.config.control.learning is None:
+                raise
+            harm = error.message
+        self.carrier.output.warning(f"iterative learning is left out: with it {harm}")
+        control = self.config.control.model_copy(update={"learning": None})
+        self.state["gains"]["control"] = control.model_dump(mode="json", exclude_none=True)
+        self.config = self._with_control(control)
+        return self._verified(self.config, "verification without learning")
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
         rmse = {when: kept[when]["rmse_mrad"] for when in ("before", "after") if "rmse_mrad" in kept.get(when, {})}
@@ -534,25 +548,14 @@ class Tune:
         return self.config.changed(control=self.original.control, joint_encoder=second)
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
-        moving = with_motion(config, self.verifying)
-        motion = VerifyingMotion(moving, trajectory_table(moving), self.config)
-        carried = self.carrier.run(moving, motion, title, also_faults=ALLOWED_FAULTS.get(title, ()))
-        rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
-        rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * self.verifying.duration_s)]
-        if carried.text is not None or not len(rows):
-            return {"fault": carried.fault.name}
-        error = 1e3 * np.asarray(rows.error_rad)
-        return {
-            "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
-            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "log": carried.log,
-            "seconds": self.verifying.duration_s,
-        }  # fmt: skip
+        return verified(self.carrier, config, self.verifying, self.config, title, ALLOWED_FAULTS.get(title, ()))
 
     # --- 9. refinement ---
 
     def _refine(self) -> None:
         """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
         gains = self.gains or self.chosen_gains(self.options.law, self.options.objective)
+        gains = replace(gains, control=self.config.control)  # without learning where that did not help
         error = self.state["verification"]["after"]["rmse_mrad"]
         allowed = [one for one in gains.tried if one.stable and not gains.goals.missed(one)]
         tried, runs = [gains.best], list[dict[str, Any]]()
