@@ -68,6 +68,10 @@ class TooWeak(MotionFault):
     """A joint that stood, stayed behind or swung slowly, hardly pushed: the law is too weak for its friction."""
 
 
+class TooQuick(MotionFault):
+    """A joint that moved too fast: by less torque it may be measured, by a stiffer law it would move no slower."""
+
+
 class TooStiff(MotionFault):
     """A joint that swung fast: its torque is later than is known yet, or its reducer softer."""
 
@@ -368,7 +372,7 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
                 break
             peak_Nm, before = GROWTH * peak_Nm, found
         return _whole(task, carrier, min(peak_Nm, task.largest_Nm), before)
-    except TooWeak as error:
+    except (TooWeak, TooQuick) as error:
         if before is None or before.coherence < GOOD_COHERENCE:
             raise
         carrier.output.note(f"  {error.message}: once more, with {text_Nm(before.peak_Nm, 2)}")
@@ -580,7 +584,7 @@ def _stage(
                 raise TooWeak(ended.message, f"{TOO_WEAK.format(task.config.joint.inertia_kgm2)}; {ended.hint}")
             if carried.fault == Fault.LIMIT_CYCLE:
                 raise (TooStiff if carried.value >= HUNTING_Hz else Pushed)(ended.message, ended.hint)
-            raise ended
+            raise TooQuick(ended.message, ended.hint) if carried.fault == Fault.VELOCITY_LIMIT else ended
         return carried.records
 
     records = moved()

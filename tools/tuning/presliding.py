@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import LimitCycle, text_Nm, text_radps
-from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
+from jointctl.drivers.errors import text_Nm, text_radps
+from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
 from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
@@ -328,6 +328,7 @@ def bristles_of(motion: PreslidingMotion, records: np.recarray, friction_Nm: tup
 # --- The step of a tune, and what it writes ---
 
 QUARTER = 0.25  # of a count, by which bristles bend at the static friction: stiffer ones end moves worse
+SPRINGS = (Fault.LIMIT_CYCLE, Fault.VELOCITY_LIMIT)  # of a joint that breaks loose from the spring
 DAMPING_RATIO = 0.24  # of the bristles with the joint's inertia: that of the shipped configurations
 
 
@@ -339,12 +340,11 @@ def measured_bristles(config: Config, carrier: Carrier) -> dict[str, Any]:
     motion = presliding_motion(config)
     if motion is None or config.friction is None:
         return {"why": "the travel is too short, the encoder too coarse, or no spring keeps the margin"}
-    try:
-        records = carrier.run(motion.config, motion, "bristles").records
-    except LimitCycle as error:
-        return {"why": error.message}
+    carried = carrier.run(motion.config, motion, "bristles", also_faults=SPRINGS)
+    if carried.text is not None:
+        return {"why": f"{carried.fault.name}: {carried.text.happened}"}
     frictions_Nm = static_frictions_Nm(config, config.friction)
-    found = bristles_of(motion, records, frictions_Nm)
+    found = bristles_of(motion, carried.records, frictions_Nm)
     if found is None:
         return {"why": f"the joint stood less than {LEAST_STRETCHES} times, or slipped"}
     seen = math.isfinite(found.stiffness_Nmprad)

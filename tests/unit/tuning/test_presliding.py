@@ -12,12 +12,13 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.errors import LimitCycle
+from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning import presliding
-from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.tuning.carry_out import Carried, Carrier
 from jointctl.tools.tuning.presliding import (
     AMPLITUDE,
     FROZEN_STRETCHES,
@@ -196,12 +197,18 @@ def carrier() -> Carrier:
     return Carrier(output, TerminalConsent(output, assume_yes=True), None)
 
 
-def test_a_spring_that_swings_measures_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def swings(*_: Any) -> None:
-        raise LimitCycle("it swings")
+@pytest.mark.parametrize("fault", [Fault.LIMIT_CYCLE, Fault.VELOCITY_LIMIT])
+def test_a_joint_that_breaks_loose_from_the_spring_has_no_bristles_that_are_measured(
+    monkeypatch: pytest.MonkeyPatch, fault: Fault
+) -> None:
+    """Of a slow joint the speed at which it springs may be more than its limit; the tune goes on without them."""
 
-    monkeypatch.setattr(Carrier, "run", swings)
-    assert measured_bristles(shipped("precise"), carrier()) == {"why": "it swings"}
+    def run(*_: Any, also_faults: tuple[Fault, ...]) -> Carried:
+        assert fault in also_faults
+        return Carried(None, fault, FaultText("it moved", "cause", "next"), "")
+
+    monkeypatch.setattr(Carrier, "run", run)
+    assert measured_bristles(shipped("precise"), carrier()) == {"why": f"{fault.name}: it moved"}
 
 
 @pytest.mark.parametrize(
@@ -218,7 +225,7 @@ def test_what_is_written_is_no_stiffer_than_a_quarter_of_a_count(
 ) -> None:
     config: Config = shipped("precise").changed(encoder__counts_per_turn=2**14)
     monkeypatch.setattr(presliding, "bristles_of", lambda *_: found)
-    monkeypatch.setattr(Carrier, "run", lambda *_: Mock())
+    monkeypatch.setattr(Carrier, "run", lambda *_, **__: Mock(text=None))
     stiffness, damping = bristle_values(measured_bristles(config, carrier()))
     assert stiffness.value == pytest.approx(written, rel=0.02)
     assert words in stiffness.source

@@ -32,6 +32,7 @@ from jointctl.tools.tuning.carry_out import (
     SUITED,
     Carried,
     HUNTING_Hz,
+    TooQuick,
     TooWeak,
     measured_response,
     response_by_any_law,
@@ -556,7 +557,7 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
 
     carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     before = with_break_away(shipped("precise"), 20.0)
-    with pytest.raises(MotionFault, match=fault.name):
+    with pytest.raises(TooQuick if fault == Fault.VELOCITY_LIMIT else MotionFault, match=fault.name):
         response_by_any_law(before, 8, carrier, 55.0)
     attempts = [(100.0, "none"), (100.0, "desired"), (1600.0, "desired"), (3200.0, "desired")]
     assert laws == (attempts if weak else attempts[:1])
@@ -635,16 +636,17 @@ def test_a_stiffer_law_follows_only_where_the_gate_lets_it(name: str, kps: list[
     assert laws == kps
 
 
+@pytest.mark.parametrize("error", [TooWeak, TooQuick])
 @pytest.mark.parametrize("coherence", [0.95, 0.85])
 def test_more_torque_than_the_law_holds_ends_with_that_of_the_stage_before(
-    monkeypatch: pytest.MonkeyPatch, coherence: float
+    monkeypatch: pytest.MonkeyPatch, coherence: float, error: type[MotionFault]
 ) -> None:
     stages: list[tuple[float, int]] = []
 
     def stage(_: Any, __: Any, peak_Nm: float, pairs: int, **_how: bool) -> Any:
         stages.append((peak_Nm, pairs))
         if peak_Nm > 3.0:
-            raise TooWeak("it swings")
+            raise error("it swings")
         return SimpleNamespace(coherence=coherence, peak_Nm=peak_Nm, legs=2 * pairs), "records", "plan"
 
     for name, fake in (("_stage", stage), ("_refuse_growth", lambda *_: None), ("_better", lambda task, _: task)):
@@ -652,7 +654,7 @@ def test_more_torque_than_the_law_holds_ends_with_that_of_the_stage_before(
     said: list[str] = []
     carrier: Any = SimpleNamespace(output=SimpleNamespace(note=said.append))
     known = coherence > GOOD_COHERENCE
-    with nullcontext() if known else pytest.raises(TooWeak, match="it swings"):
+    with nullcontext() if known else pytest.raises(error, match="it swings"):
         found, *_ = measured_response(response_task(shipped("precise"), None, 12), carrier)
         assert found.peak_Nm == pytest.approx(2.25)
         assert "it swings: once more, with 2.25 Nm" in "".join(said)
