@@ -302,7 +302,7 @@ def _fill_stream(record: StreamConstants, config: Config) -> None:
     stream, limits = config.stream, config.limits
     record.delay_ns, record.timeout_ns = round(stream.delay_s * 1e9), round(stream.timeout_s * 1e9)
     for key, automatic in (
-        ("acceleration_max_radps2", 0.5 * limits.torque_max_Nm / config.joint.inertia_kgm2),
+        ("acceleration_max_radps2", 0.5 * acceleration_beside_gravity_radps2(config)),
         ("jump_max_rad", limits.following_error_max_rad),
         ("torque_max_Nm", 0.2 * limits.torque_max_Nm),
         ("torque_rate_max_Nmps", 0.1 * limits.torque_rate_max_Nmps),

@@ -151,6 +151,13 @@ def test_learning_leads_by_as_long_at_any_rate(rate_Hz: float) -> None:
     assert learning is None or learning.lead_cycles / rate_Hz == pytest.approx(0.01, abs=0.5 / rate_Hz)
 
 
+@pytest.mark.parametrize(("gravity_Nm", "auto_radps2"), [(0.0, 2.5), (210.0, 0.75)])
+def test_set_points_accelerate_by_half_of_what_gravity_leaves(gravity_Nm: float, auto_radps2: float) -> None:
+    """More is asked of a joint that holds its load than it has to brake with."""
+    record = axis_constants(joint(SIZES["loaded base"]._replace(gravity_Nm=gravity_Nm)), np.zeros((1, 5)))[0]
+    assert record.stream.acceleration_max_radps2 == pytest.approx(auto_radps2)
+
+
 @pytest.mark.parametrize(
     ("friction_Nm", "noise_Nm"), [(0.05, 0.2), (1.2726, 5.0), (7.6, 5.0), (19.0575, 5.0), (100.0, 20.0)]
 )
