@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -255,6 +256,17 @@ def common_state(names: Sequence[str], states: Sequence[str]) -> str:
         if state != UNTOUCHED and not is_safe(state)
     ]  # fmt: skip
     return "; ".join(powered) if powered else ", ".join([off[0], *differing])
+
+
+# --- Whole numbers as every drive is sent them ---
+
+
+@kernel
+def saturated(value: float, limit: float) -> int:
+    """`value` rounded, within +-`limit` before the cast; 0 if not finite."""
+    if not math.isfinite(value):
+        return 0
+    return round(min(max(value, -limit), limit))
 
 
 # --- Position counters of 32 bits that run over, as every drive reports them ---

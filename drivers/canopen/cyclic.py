@@ -15,7 +15,6 @@ any more.
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from typing import Annotated
 
@@ -24,7 +23,7 @@ import numpy as np
 from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
 from jointctl.drivers.canopen import cia
 from jointctl.drivers.canopen.cia import NmtState, State
-from jointctl.drivers.drive import HALF_WRAP, WRAP, take_counts
+from jointctl.drivers.drive import HALF_WRAP, WRAP, saturated, take_counts
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import INT32_MAX, array_of, f8, i4, i8, record, u1, u4
@@ -381,21 +380,14 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
 
 @kernel
 def torque_permille(port: CanopenPort, torque_Nm: float) -> int:
-    """Joint torque [Nm] in 1/1000 of the drive's rated value, saturated before the cast; 0 if not finite."""
-    value = torque_Nm / port.torque_Nmppermille
-    if not math.isfinite(value):
-        return 0
-    limit = float(port.max_permille)
-    return round(min(max(value, -limit), limit))
+    """Joint torque [Nm] in 1/1000 of the drive's rated value."""
+    return saturated(torque_Nm / port.torque_Nmppermille, float(port.max_permille))
 
 
 @kernel
 def velocity_units(port: CanopenPort, velocity_radps: float) -> int:
-    """Joint velocity [rad/s] in units of 60FF, saturated before the cast; 0 if not finite."""
-    value = velocity_radps / port.velocity_radpspunit
-    if not math.isfinite(value):
-        return 0
-    return round(min(max(value, -float(INT32_MAX)), float(INT32_MAX)))
+    """Joint velocity [rad/s] in units of 60FF."""
+    return saturated(velocity_radps / port.velocity_radpspunit, float(INT32_MAX))
 
 
 @kernel

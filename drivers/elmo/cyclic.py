@@ -18,13 +18,12 @@ stands.
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
 
-from jointctl.drivers.drive import WRAP, take_counts
+from jointctl.drivers.drive import WRAP, saturated, take_counts
 from jointctl.drivers.elmo.dialogue import (
     AMPLIFIER_MASK,
     CR,
@@ -399,22 +398,14 @@ def put_command(port: ElmoPort, question: int, value_milli: int, decimals: int) 
 
 @kernel
 def current_mA(port: ElmoPort, torque_Nm: float) -> int:
-    """Joint torque [Nm] as the value of TC [mA], saturated before the cast; 0 if not finite."""
-    value = 1000.0 * torque_Nm / port.torque_NmpA
-    if not math.isfinite(value):
-        return 0
-    limit = float(port.max_current_mA)
-    return round(min(max(value, -limit), limit))
+    """Joint torque [Nm] as the value of TC [mA]."""
+    return saturated(1000.0 * torque_Nm / port.torque_NmpA, float(port.max_current_mA))
 
 
 @kernel
 def velocity_cps(port: ElmoPort, velocity_radps: float) -> int:
-    """Joint velocity [rad/s] as the value of JV [counts/s], saturated before the cast; 0 if not finite."""
-    value = velocity_radps / port.position_radpcount
-    if not math.isfinite(value):
-        return 0
-    limit = float(port.max_velocity_cps)
-    return round(min(max(value, -limit), limit))
+    """Joint velocity [rad/s] as the value of JV [counts/s]."""
+    return saturated(velocity_radps / port.position_radpcount, float(port.max_velocity_cps))
 
 
 @kernel

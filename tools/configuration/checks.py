@@ -380,6 +380,14 @@ def _ripple_torque_problems(name: str, amplitudes_Nm: tuple[float, ...], config:
     return [f"{name} (={list(amplitudes_Nm)}) must be less than limits.torque_max_Nm (={largest_Nm:g}), added up"]
 
 
+def _length_problems(key: str, amplitudes: tuple[float, ...], series: Ripple | FrictionAngle) -> list[str]:
+    counts = [len(values) for values in (amplitudes, series.per_motor_turn, series.phase_rad)]
+    if len(set(counts)) == 1:
+        return []
+    given = ", ".join(map(str, counts))
+    return [f"{key}, per_motor_turn and phase_rad (={given}) must be equally many numbers"]
+
+
 def _ripple_problems(config: Config) -> list[str]:
     """[ripple] belongs to one mounting of the encoder, to a law that takes the joint as rigid, and is fed once."""
     made, encoder = config.ripple, config.encoder
@@ -387,10 +395,7 @@ def _ripple_problems(config: Config) -> list[str]:
         return []
     why = "it was measured with another mounting; `jointctl map` measures anew"
     found = _mounting_problems("ripple", made, encoder, why)
-    counts = [len(values) for values in (made.torque_Nm, made.per_motor_turn, made.phase_rad)]
-    if len(set(counts)) > 1:
-        given = ", ".join(map(str, counts))
-        found.append(f"ripple.torque_Nm, per_motor_turn and phase_rad (={given}) must be equally many numbers")
+    found += _length_problems("ripple.torque_Nm", made.torque_Nm, made)
     found += _ripple_torque_problems("ripple.torque_Nm", made.torque_Nm, config)
     if _is_flexible(config):
         found.append('[ripple] is not for control.kind "flexible_joint": there it is torque_ripple of [reducer.map]')
@@ -454,11 +459,7 @@ def _angle_problems(section: str, friction: Friction, encoder: Encoder) -> list[
     made = friction.angle
     if made is None:
         return []
-    counts = [len(values) for values in (made.share, made.per_motor_turn, made.phase_rad)]
-    found = []
-    if len(set(counts)) > 1:
-        given = ", ".join(map(str, counts))
-        found.append(f"{section}.angle.share, per_motor_turn and phase_rad (={given}) must be equally many numbers")
+    found = _length_problems(f"{section}.angle.share", made.share, made)
     if not sum(map(abs, made.share)) <= LARGEST_SHARE:
         found.append(f"{section}.angle.share (={list(made.share)}) must add up to {LARGEST_SHARE:g} at most, unsigned")
     return found + _mounting_problems(f"{section}.angle", made, encoder, "it was identified with another mounting")

@@ -75,7 +75,7 @@ class Sizes:
     """Ranges that a scenario draws from, evenly: duration [s] and magnitude (see `FaultKind`)."""
 
     duration_s: tuple[float, float]
-    magnitude: tuple[float, float]
+    magnitude: tuple[float, float] = (1.0, 1.0)  # of what is only there or not
     log_duration: bool = False
 
 
@@ -99,8 +99,8 @@ def _lost(
     kind: FaultKind, causes: frozenset[Fault], *, certain: bool, harmless_s: float = 0.045, emergency: int = 0
 ) -> FaultClass:
     return FaultClass(
-        kind, Sizes((0.06, LONG_s), (1.0, 1.0), log_duration=True), Sizes((0.001, harmless_s), (1.0, 1.0)),
-        causes, certain, True, emergency,
+        kind, Sizes((0.06, LONG_s), log_duration=True), Sizes((0.001, harmless_s)), causes, certain, True,
+        emergency,
     )  # fmt: skip
 
 
@@ -117,11 +117,11 @@ _CLASSES = (
     _lost(FaultKind.TPDO_LOST, _STALE | MOTION, certain=True),
     _lost(FaultKind.BUS_OFF, _STALE | {Fault.BUS_ERROR}, certain=True, harmless_s=0.015),
     FaultClass(
-        FaultKind.CONTROLLER_HEARTBEAT_LOST, Sizes((0.4, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.06), (1.0, 1.0)),
+        FaultKind.CONTROLLER_HEARTBEAT_LOST, Sizes((0.4, LONG_s)), Sizes((0.001, 0.06)),
         _STALE | {Fault.DRIVE_NOT_ENABLED}, True, on_wire=True,
     ),
     FaultClass(
-        FaultKind.DRIVE_HEARTBEAT_LOST, Sizes((0.85, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.35), (0.0, 1.0)),
+        FaultKind.DRIVE_HEARTBEAT_LOST, Sizes((0.85, LONG_s)), Sizes((0.001, 0.35), (0.0, 1.0)),
         frozenset({Fault.DRIVE_SILENT}), True, on_wire=True,
     ),
     FaultClass(
@@ -155,14 +155,9 @@ _CLASSES = (
         _STALE | MOTION, True, on_wire=True,
     ),
     FaultClass(FaultKind.FOREIGN_FRAMES, None, Sizes(_ALWAYS, (1.0, 16.0)), on_wire=True),
-    FaultClass(
-        FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS, (1.0, 1.0)), None, frozenset({Fault.DRIVE_RESTARTED}), True
-    ),
-    FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s), (1.0, 1.0)), None, frozenset({Fault.DRIVE_FAULT}), True),
-    FaultClass(
-        FaultKind.ENCODER_STUCK, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)),
-        READING | NOT_STARTED,
-    ),
+    FaultClass(FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS), None, frozenset({Fault.DRIVE_RESTARTED}), True),
+    FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s)), None, frozenset({Fault.DRIVE_FAULT}), True),
+    FaultClass(FaultKind.ENCODER_STUCK, Sizes((0.05, LONG_s)), Sizes((0.001, 0.002)), READING | NOT_STARTED),
     FaultClass(
         FaultKind.ENCODER_JUMP, Sizes(_ALWAYS, (0.0205, 1.0)), Sizes(_ALWAYS, (0.00001, 0.0005)),
         READING | NOT_STARTED, True,
@@ -171,22 +166,18 @@ _CLASSES = (
         FaultKind.ENCODER_DRIFT, Sizes(_ALWAYS, (0.05, 1.0)), Sizes((0.001, 1.0), (0.0001, 0.01)),
         READING | NOT_STARTED | {Fault.REFERENCE_LIMIT},
     ),
-    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, READING | NOT_STARTED),
-    FaultClass(
-        FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION
-    ),
+    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s)), None, READING | NOT_STARTED),
+    FaultClass(FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s)), Sizes((0.001, 0.002)), MOTION),
     FaultClass(
         FaultKind.TORQUE_SATURATED, Sizes((0.05, LONG_s), (0.0, 30.0)), Sizes(_ALWAYS, (58.0, 100.0)), MOTION
     ),
-    FaultClass(
-        FaultKind.CURRENT_LOOP_DEAD, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION
-    ),
+    FaultClass(FaultKind.CURRENT_LOOP_DEAD, Sizes((0.05, LONG_s)), Sizes((0.001, 0.002)), MOTION),
     FaultClass(
         FaultKind.LOAD_JUMP, Sizes((0.01, 0.2), (15.0, 40.0)), Sizes(_ALWAYS, (0.5, 4.0)),
         MOTION | NOT_STARTED,
     ),
     FaultClass(
-        FaultKind.LOOP_HELD_UP, Sizes((0.06, 1.0), (1.0, 1.0)), Sizes((0.001, 0.025), (1.0, 1.0)),
+        FaultKind.LOOP_HELD_UP, Sizes((0.06, 1.0)), Sizes((0.001, 0.025)),
         MOTION | _STALE | {Fault.OVERRUN, Fault.DRIVE_NOT_ENABLED}, True, on_wire=True,
     ),
     FaultClass(
@@ -194,21 +185,19 @@ _CLASSES = (
         frozenset({Fault.OVERRUN}), True,
     ),
     FaultClass(
-        FaultKind.SUPERVISOR_SILENT, Sizes((1.05, LONG_s), (1.0, 1.0)), Sizes((0.01, 0.95), (1.0, 1.0)),
-        frozenset({Fault.SUPERVISOR_LOST}),
+        FaultKind.SUPERVISOR_SILENT, Sizes((1.05, LONG_s)), Sizes((0.01, 0.95)), frozenset({Fault.SUPERVISOR_LOST}),
     ),
 )  # fmt: skip
 _OF_A_PROGRAM = (
     FaultClass(
         # harmful: longer than stream.client_timeout_s
-        FaultKind.PROGRAM_SILENT, Sizes((1.1, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.9), (1.0, 1.0)),
-        frozenset({Fault.CLIENT_SILENT}),
+        FaultKind.PROGRAM_SILENT, Sizes((1.1, LONG_s)), Sizes((0.001, 0.9)), frozenset({Fault.CLIENT_SILENT}),
     ),
     FaultClass(FaultKind.PROGRAM_WILD, None, Sizes((0.002, 1.0), (0.05, 100.0))),  # nothing of it is followed
 )  # fmt: skip
 _OF_A_PAIR = (
     FaultClass(FaultKind.STOP_REQUESTED, None, Sizes((LONG_s, LONG_s), (1.0, 3.99))),
-    FaultClass(FaultKind.LOOP_KILLED, None, Sizes((LONG_s, LONG_s), (1.0, 1.0)), on_wire=True),  # reported by no one
+    FaultClass(FaultKind.LOOP_KILLED, None, Sizes((LONG_s, LONG_s)), on_wire=True),  # reported by no one
 )
 FAULT_CLASSES = {item.kind: item for item in (*_CLASSES, *_OF_A_PROGRAM, *_OF_A_PAIR)}
 EMERGENCY_CODES = (0x2311, 0x3120, 0x3310, 0x4310, 0x5441, 0x7121, 0x7300, 0x8480, 0x8611)
