@@ -217,6 +217,13 @@ class DeviceOnBus:
         finally:
             drive.close()
 
+    @contextmanager
+    def commissioned(self, **changes: Any) -> Iterator[CanopenDrive]:
+        """As `opened`, and commissioned."""
+        with self.opened(**changes) as drive:
+            drive.commission()
+            yield drive
+
     def value(self, index: int, sub: int = 0) -> int:
         """What the drive's dictionary holds."""
         return int(self.device.objects.value(index, sub))

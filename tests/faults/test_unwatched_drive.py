@@ -45,8 +45,7 @@ def nmt_state(bus: Any) -> NmtState:
 # --- a drive that does not switch off keeps its watchdog ---
 @pytest.mark.parametrize(("status", "watchdog"), [(ENABLED, WATCHDOG), (DISABLED, 0)])
 def test_the_watchdog_is_only_disarmed_in_a_drive_that_is_off(joint: Any, status: int, watchdog: int) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         assert consumer_heartbeat(joint) == WATCHDOG
         joint.answers[0x6041, 0] = status
         drive.make_safe()
@@ -56,8 +55,7 @@ def test_the_watchdog_is_only_disarmed_in_a_drive_that_is_off(joint: Any, status
 def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
     joint: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         brake = switch_off.brake
 
         def stopped_meanwhile(objects: Any, sleep: Any, longest_s: float) -> None:
@@ -94,8 +92,7 @@ def another_mode_is_chosen(bus: Any) -> None:
 def test_a_drive_that_has_changed_since_it_was_commissioned_is_not_started(
     joint: Any, meanwhile: Callable[[Any], None], words: str
 ) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         meanwhile(joint)
         with pytest.raises((BusError, DeviceError), match=words):
             drive.start_cyclic()
@@ -103,8 +100,7 @@ def test_a_drive_that_has_changed_since_it_was_commissioned_is_not_started(
 
 
 def test_a_drive_that_is_as_it_was_is_started(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         drive.start_cyclic()
         assert drive._objects.read(0x1016, 1, what="watchdog") == WATCHDOG
         assert nmt_state(joint) == NmtState.OPERATIONAL

@@ -175,13 +175,11 @@ def test_csp_begins_with_the_target_where_the_joint_stands(joint: Any) -> None:
 
 
 def test_csv_of_a_run_maps_the_torque_offset_and_its_twin_of_a_sweep_does_not(joint: Any) -> None:
-    with joint.opened(mode="csv", holds_alone=True, torque_offset=True) as drive:
-        drive.commission()
+    with joint.commissioned(mode="csv", holds_alone=True, torque_offset=True) as drive:
         port = drive.port()[0]
     assert [joint.value(0x1600, sub) for sub in range(4)] == [3, 0x60400010, 0x60FF0020, 0x60B20010]
     assert (port.target_is_velocity, port.torque_offset_at, port.offset_rpdo_id) == (1, 6, 0)
-    with joint.opened(mode="csv") as drive:
-        drive.commission()
+    with joint.commissioned(mode="csv") as drive:
         assert drive.port()[0].torque_offset_at == -1
     assert joint.value(0x1600) == 2
 
@@ -576,8 +574,7 @@ def test_a_stop_at_the_last_moment_keeps_the_drive_from_being_started(joint: Any
 def test_the_frames_of_the_loop_are_not_received_from_its_start_on(joint: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[tuple[int, int]]] = []
     monkeypatch.setattr(network, "receive_only", lambda _, wanted: asked.append(wanted))
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         assert not asked
         drive.start_cyclic()
     assert [(0x081, 0x7FF) in wanted for wanted in asked] == [True]
@@ -585,8 +582,7 @@ def test_the_frames_of_the_loop_are_not_received_from_its_start_on(joint: Any, m
 
 @pytest.mark.parametrize("started", [True, False])
 def test_who_comes_after_the_start_does_not_keep_us_from_switching_off(joint: Any, started: bool) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         if started:
             drive.start_cyclic()
         joint.send(0x601, b"\x2b\x40\x60\x00\x06\0\0\0")
@@ -600,8 +596,7 @@ def test_a_drive_whose_fault_was_cleared_is_made_safe(joint: Any) -> None:
 
 
 def test_who_comes_after_another_commissioning_keeps_the_drive_until_it_is_started_again(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         drive.start_cyclic()
         assert drive.make_safe() == "switch on disabled"
         drive.commission()
@@ -610,8 +605,7 @@ def test_who_comes_after_another_commissioning_keeps_the_drive_until_it_is_start
 
 
 def test_without_an_object_for_it_there_is_no_thermometer(joint: Any) -> None:
-    with joint.opened(temperature=None) as drive:
-        drive.commission()
+    with joint.commissioned(temperature=None) as drive:
         assert drive.thermometer() is None
 
 
@@ -688,8 +682,7 @@ def test_a_bus_that_fails_is_told_with_the_step(joint: Any, step: str, when: str
 
 
 def test_a_drive_that_has_lost_its_mode_is_not_started(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         joint.requests.clear()
         joint.answers[0x6061, 0] = 8
         with pytest.raises(DeviceError, match="node 1: 6061 shows mode 8, it was 10"):
@@ -715,8 +708,7 @@ class Adapter:
 
 @pytest.mark.parametrize("at_attempt", [1, 3, REOPEN_ATTEMPTS])
 def test_an_adapter_is_lent_to_the_loop_and_taken_back(joint: Any, at_attempt: int) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         adapter = Adapter(joint, drive, at_attempt)
         lent: Any = drive._network.bus
         drive.start_cyclic()
@@ -730,8 +722,7 @@ def test_an_adapter_is_lent_to_the_loop_and_taken_back(joint: Any, at_attempt: i
 
 
 def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_joint(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         adapter = Adapter(joint, drive, REOPEN_ATTEMPTS + 1)
         drive.start_cyclic()
         state = drive.make_safe()
@@ -742,8 +733,7 @@ def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_join
 
 @pytest.mark.parametrize("change", ["mode", "deadline", "another"])
 def test_a_drive_that_changes_at_its_start_is_not_handed_over(joint: Any, change: str) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         Adapter(joint, drive, 1)
 
         def gate() -> None:

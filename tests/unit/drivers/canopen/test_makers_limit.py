@@ -65,8 +65,7 @@ def test_it_is_written_read_back_and_given_back_when_the_drive_is_off(epos: Devi
 
 
 def test_it_is_verified_once_more_before_the_loop_begins(epos: DeviceOnBus) -> None:
-    with epos.opened() as drive:
-        drive.commission()
+    with epos.commissioned() as drive:
         epos.store(*PLACE, HELD)
         with refusal(r"has changed .* object 3001:2 \(torque limit\) is 5000, 4958 was set"):
             drive.start_cyclic()
@@ -75,8 +74,7 @@ def test_it_is_verified_once_more_before_the_loop_begins(epos: DeviceOnBus) -> N
 
 
 def test_what_it_held_at_first_is_given_back_after_a_second_commissioning(epos: DeviceOnBus) -> None:
-    with epos.opened(torque_max_Nm=12.1) as drive:
-        drive.commission()
+    with epos.commissioned(torque_max_Nm=12.1) as drive:
         drive.commission()
         drive.make_safe()
     assert epos.downloads(*PLACE) == [1000, 1000, HELD]
@@ -97,15 +95,19 @@ def test_it_is_never_raised_nor_rounded_up(epos: DeviceOnBus, torque_max_Nm: flo
     assert epos.downloads(*PLACE) == []
 
 
-def test_a_unit_that_is_wrong_by_a_thousand_does_not_switch_the_limit_off(tmp_path: Path) -> None:
-    words = r"needs 4958677 in .* holds 5000 = 0\.0605 Nm and is only ever lowered"
-    with joint_of(tmp_path, drive__torque_limit_rated_counts=5e6) as joint, joint.opened() as drive, refusal(words):
-        drive.commission()
-
-
-def test_counts_so_coarse_that_the_torque_would_be_cut_are_refused(tmp_path: Path) -> None:
-    words = r"torque_max_Nm \(=60\) would be cut to 48\.4 Nm by object 3001:2 .* count is 12\.1 Nm"
-    with joint_of(tmp_path, drive__torque_limit_rated_counts=5) as joint, joint.opened() as drive, refusal(words):
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("rated_counts", 5e6, r"needs 4958677 in .* holds 5000 = 0\.0605 Nm and is only ever lowered"),
+        ("rated_counts", 5, r"torque_max_Nm \(=60\) would be cut to 48\.4 Nm by object 3001:2 .* count is 12\.1 Nm"),
+        ("object", "2110", r"maker\.eds has no object 2110 \(torque limit\)"),
+    ],
+    ids=["a unit that is wrong by a thousand", "counts so coarse that the torque would be cut", "no such object"],
+)
+def test_what_the_file_says_of_it_and_the_drive_does_not_is_refused(
+    tmp_path: Path, key: str, value: Any, words: str
+) -> None:
+    with joint_of(tmp_path, **{f"drive__torque_limit_{key}": value}) as joint, joint.opened() as drive, refusal(words):
         drive.commission()
     assert joint.downloads(*PLACE) == []
 
@@ -113,8 +115,7 @@ def test_counts_so_coarse_that_the_torque_would_be_cut_are_refused(tmp_path: Pat
 def test_a_drive_that_did_not_answer_gets_it_back_when_it_is_made_safe_again(
     epos: DeviceOnBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with epos.opened() as drive:
-        drive.commission()
+    with epos.commissioned() as drive:
         read = drive._objects.read
 
         def silent(index: int, *sub: int, what: str) -> int:
@@ -152,12 +153,6 @@ def test_one_that_reads_back_another_value_is_refused_and_set_back(epos: DeviceO
     with epos.opened() as drive, refusal(r"reads back 4950, 4958 was written"):
         drive.commission()
     assert epos.downloads(*PLACE) == [4958, HELD]
-
-
-def test_a_drive_that_lacks_it_is_refused_by_its_number(tmp_path: Path) -> None:
-    words = r"maker\.eds has no object 2110 \(torque limit\)"
-    with joint_of(tmp_path, drive__torque_limit_object="2110") as joint, joint.opened() as drive, refusal(words):
-        drive.commission()
 
 
 def test_a_drive_with_neither_is_refused_with_the_key(epos: DeviceOnBus) -> None:

@@ -244,8 +244,7 @@ def test_what_must_be_there_is_refused_by_name(
 
 
 def test_an_object_is_asked_for_once_and_anew_with_each_commissioning(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         objects = drive._objects
         before = len(joint.requests)
         assert [objects.has(0x6077) for _ in range(5)] == [True] * 5

@@ -36,8 +36,11 @@ def listening(own_loop: bool = False) -> OtherControllers:
     return others
 
 
-def heard(others: OtherControllers, identifier: int, data: bytes = b"") -> str:
-    others.on_message_received(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+def heard(others: OtherControllers, identifier: int, data: bytes | None = b"") -> str:
+    """`data` None: a remote request."""
+    others.on_message_received(
+        can.Message(arbitration_id=identifier, data=data, is_remote_frame=data is None, is_extended_id=False)
+    )
     return others.found()
 
 
@@ -50,11 +53,15 @@ CONTROLLER = [
     (0x200 + NODE, bytes(4), "1 x RPDO to node 5 (205h)"),
     (0x500 + 9, bytes(4), "1 x RPDO to node 9 (509h)"),
     (0x700 + MASTER, b"\x05", "1 x heartbeat of node 126, which is our own (drive.master_node)"),
+    (0x700 + NODE, None, "1 x node guarding of node 5 (705h)"),
+    (0x700 + 9, None, "1 x node guarding of node 9 (709h)"),
+    (0x180 + NODE, None, "1 x remote request for a TPDO of node 5 (185h)"),
+    (0x480 + NODE, None, "1 x remote request for a TPDO of node 5 (485h)"),
 ]
 
 
 @pytest.mark.parametrize(("identifier", "data", "words"), CONTROLLER)
-def test_what_only_a_controller_sends_refuses_the_run(identifier: int, data: bytes, words: str) -> None:
+def test_what_only_a_controller_sends_refuses_the_run(identifier: int, data: bytes | None, words: str) -> None:
     others = listening()
     assert heard(others, identifier, data) == words
     with pytest.raises(BusError, match="another controller is active on this bus"):
@@ -103,31 +110,10 @@ def test_frames_with_long_identifiers_and_those_of_errors_are_no_ones_command(ki
     assert others.found() == ""
 
 
-def asked(others: OtherControllers, identifier: int) -> str:
-    others.on_message_received(can.Message(arbitration_id=identifier, is_remote_frame=True, is_extended_id=False))
-    return others.found()
-
-
-@pytest.mark.parametrize(
-    ("identifier", "words"),
-    [
-        (0x700 + NODE, "1 x node guarding of node 5 (705h)"),
-        (0x700 + 9, "1 x node guarding of node 9 (709h)"),
-        (0x180 + NODE, "1 x remote request for a TPDO of node 5 (185h)"),
-        (0x480 + NODE, "1 x remote request for a TPDO of node 5 (485h)"),
-    ],
-)
-def test_a_master_that_only_asks_for_the_state_refuses_the_run(identifier: int, words: str) -> None:
-    others = listening()
-    assert asked(others, identifier) == words
-    with pytest.raises(BusError, match="another controller is active on this bus"):
-        others.refuse()
-
-
 @pytest.mark.parametrize("identifier", [0x700 + 7, 0x180 + 7, 0x580 + NODE, 0x700])
 def test_its_twin_who_asks_other_nodes_has_not_this_drive(identifier: int) -> None:
     others = listening()
-    assert asked(others, identifier) == ""
+    assert heard(others, identifier, None) == ""
     assert others.heartbeats == set()  # it is not node 7 that has sent it
 
 

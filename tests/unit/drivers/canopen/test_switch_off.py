@@ -353,8 +353,7 @@ def test_a_full_disk_behind_its_output_does_not_hide_it(
 
 # --- the watchdog ---
 def test_stop_leaves_the_watchdog_as_it_is(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         armed, deadline = joint.value(0x1016, 1), joint.value(0x1400, 5)
         assert (armed & 0xFFFF, deadline) > (0, 0)
         assert joint.stop_drive() == "switch on disabled"
@@ -364,8 +363,7 @@ def test_stop_leaves_the_watchdog_as_it_is(joint: Any) -> None:
 
 
 def test_only_its_own_watchdog_is_taken_away(joint: Any) -> None:
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         other = 42 << 16 | 500
         drive._objects.write(0x1016, 1, other, what="another program's consumer heartbeat time")
         assert drive.make_safe() == "switch on disabled"
@@ -397,8 +395,7 @@ def another_controller(joint: Any) -> Iterator[None]:
 @pytest.fixture
 def waiting(joint: Any) -> Iterator[Any]:
     """Commissioned; the user is being asked."""
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         joint.requests.clear()
         yield drive
 

@@ -87,8 +87,7 @@ def test_a_drive_without_a_deadline_is_told(commission: Any, joint: Any, missing
 @pytest.mark.parametrize(("pause_ms", "stops"), [(95, False), (101, True)])
 def test_an_enabled_drive_whose_rpdos_stay_away_stops_by_itself(joint: Any, pause_ms: int, stops: bool) -> None:
     """SYNC and heartbeat go on: only the deadline sees it."""
-    with joint.opened() as drive:
-        drive.commission()
+    with joint.commissioned() as drive:
         drive.start_cyclic()
         drive._objects.read(0x1000, what="device type")
     joint.stop()

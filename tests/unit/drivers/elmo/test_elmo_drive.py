@@ -37,9 +37,7 @@ def lacks(*names: bytes, code: bytes = b"\x02") -> Answer:
 
 @pytest.fixture
 def commissioned(port: MemoryPort) -> ElmoDrive:
-    drive = port.drive()
-    drive.commission()
-    return drive
+    return port.commissioned()
 
 
 # --- Commissioning of the serial drive on a port in memory: what it writes, what it refuses and in which words ---
@@ -58,8 +56,7 @@ class TestCommissioning:
 
     @pytest.mark.parametrize("echo", [True, False])
     def test_the_echo_is_set_as_configured(self, port: MemoryPort, echo: bool) -> None:
-        drive = port.drive(echo=echo)
-        drive.commission()
+        drive = port.commissioned(echo=echo)
         assert port.device.echo == echo
         assert drive.port()[0].echo == int(echo)
 
@@ -146,8 +143,7 @@ class TestCommissioning:
     @pytest.mark.parametrize("noise", [b"nan", b"inf", b"1e999"])
     def test_noise_in_the_confirmation_is_not_raised_at_the_end(self, port: MemoryPort, noise: bytes) -> None:
         """`make_safe` never raises: what is closed and reported after it would be left out."""
-        drive = port.drive()
-        drive.commission()
+        drive = port.commissioned()
         port.answer = saying(b"MO\r" + noise + b";", b"MO")
         state = drive.make_safe()
         assert state.startswith("unknown: MO (=")
@@ -229,8 +225,7 @@ class TestSpeedMode:
                 port.drive(mode="speed", rate_Hz=rate_Hz).commission()
 
     def test_make_safe_ends_a_jog(self, port: MemoryPort) -> None:
-        drive = port.drive(mode="speed")
-        drive.commission()
+        drive = port.commissioned(mode="speed")
         for line in (b"MO=1", b"JV=20000", b"BG"):
             port.device.execute(line)
         port.device.advance_to(1.0)
@@ -268,8 +263,7 @@ class TestWhileTheQuestionIsOpen:
     def test_a_drive_that_has_changed_is_not_started(
         self, port: MemoryPort, happens: Callable[[MemoryPort], None], echo: bool
     ) -> None:
-        drive = port.drive(echo=echo)
-        drive.commission()
+        drive = port.commissioned(echo=echo)
         happens(port)
         port.commands.clear()
         with pytest.raises(DeviceError, match="has changed since it was commissioned") as caught:
@@ -279,8 +273,7 @@ class TestWhileTheQuestionIsOpen:
 
     @pytest.mark.parametrize("line", [b"UM=1", b"JV=5", b"AC=1000000", b"PM=0", b"PL[1]=9"])
     def test_nor_one_in_speed_mode(self, port: MemoryPort, line: bytes) -> None:
-        drive = port.drive(mode="speed", rate_Hz=100.0)
-        drive.commission()
+        drive = port.commissioned(mode="speed", rate_Hz=100.0)
         drive.start_cyclic()
         port.device.execute(line)
         with pytest.raises(DeviceError, match="has changed since it was commissioned"):
@@ -288,16 +281,14 @@ class TestWhileTheQuestionIsOpen:
 
     def test_its_twin_torque_mode_because_speed_mode_was_refused(self, port: MemoryPort) -> None:
         port.answer = saying(b"SD\r1;", b"SD")
-        drive = port.drive(mode="auto", rate_Hz=100.0)
-        drive.commission()
+        drive = port.commissioned(mode="auto", rate_Hz=100.0)
         port.device.execute(b"PM=0")  # of no importance in torque mode
         drive.start_cyclic()
         assert drive.port()[0].target_is_velocity == 0
 
     @pytest.mark.parametrize("echo", [True, False])
     def test_its_twin_nothing_has_changed(self, port: MemoryPort, echo: bool) -> None:
-        drive = port.drive(echo=echo)
-        drive.commission()
+        drive = port.commissioned(echo=echo)
         for line in (b"PL[1]=6.01", b"UM=1"):
             port.device.execute(line)
         drive.start_cyclic()
@@ -402,8 +393,7 @@ class TestMakeSafe:
         assert port.closed
 
     def test_after_a_restart_with_the_echo_back(self, port: MemoryPort) -> None:
-        drive = port.drive(echo=False)
-        drive.commission()
+        drive = port.commissioned(echo=False)
         port.device.restart()
         assert drive.make_safe() == "off"
 

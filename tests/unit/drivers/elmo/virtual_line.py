@@ -73,6 +73,11 @@ class MemoryPort:
         settings = dataclasses.replace(SETTINGS, **changes)
         return ElmoDrive(settings, open_port=lambda path, baud: self, clock=lambda: self.now_s)
 
+    def commissioned(self, **changes: Any) -> ElmoDrive:
+        drive = self.drive(**changes)
+        drive.commission()
+        return drive
+
 
 # --- The cyclic exchange and the virtual drive's interpreter, with a line of memory between them ---
 PERIOD_S = 1.0 / 150.0
