@@ -12,8 +12,6 @@ with 1 if a run was ended by the monitor, was told to be noisy, or lost its lear
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -29,6 +27,7 @@ sys.path.insert(0, str(ROOT))
 from jointctl.firmware_py.states import Fault, Notice  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
+from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.experiments.scenarios import Change, Scenario, controller_constants, named, run_scenario  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 
@@ -111,14 +110,6 @@ def outcomes(task: Task) -> list[Outcome]:
     return found
 
 
-def carry_out(work: Sequence[Task], workers: int) -> list[Outcome]:
-    """All runs, in as many processes."""
-    if workers == 1:
-        return [outcome for task in work for outcome in outcomes(task)]
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        return [outcome for some in pool.imap_unordered(outcomes, work) for outcome in some]
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seed", type=int, action="append")
@@ -127,14 +118,14 @@ def main() -> int:
     parser.add_argument("--controllers", default=",".join(CONTROLLERS))
     parser.add_argument("--base", default="precise")
     parser.add_argument("--with-stop", action="store_true")
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--workers", type=int, help="processes; default: one a core")
     chosen = parser.parse_args()
     controllers = chosen.controllers.split(",")
     began_s = time.monotonic()
     work = tasks(
         chosen.seed or [1], chosen.plants, controllers, runs=chosen.runs, base=chosen.base, with_stop=chosen.with_stop
     )
-    found = carry_out(work, chosen.workers)
+    found = [outcome for some in Workers(chosen.workers).results(outcomes, work) for outcome in some]
     for name in controllers:
         mine = [outcome for outcome in found if outcome.controller == name]
         faults = sorted({outcome.fault for outcome in mine} - {Fault.NONE.name})

@@ -107,6 +107,11 @@ class Guarded:
             self.started(**changes)
         return self.guard.run()  # type: ignore[no-any-return]
 
+    def run_until_off(self, seconds: float) -> int:
+        """The supervisor's word that the drive is off comes after that time."""
+        self.after(seconds, lambda: self.say({"state": "off"}))
+        return self.run()
+
     def after(self, seconds: float, action: Callable[[], object]) -> None:
         self._due.append((self.now_ns + round(seconds * SECOND_ns), action))  # type: ignore[arg-type]
         self._due.sort(key=lambda entry: entry[0])
@@ -354,8 +359,7 @@ def test_nothing_is_reached_behind_another_adapter(
 def test_a_port_that_was_unplugged_keeps_no_name(world: Guarded) -> None:
     tty = world.started()._tty
     world.after(0.5, world.unplug)
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert world.guard._tty == -1
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(tty)
@@ -365,8 +369,7 @@ def test_a_port_that_was_unplugged_keeps_no_name(world: Guarded) -> None:
 
 def test_what_a_drive_says_is_for_others_to_read(world: Guarded) -> None:
     world.after(0.5, lambda: world.says(b"MO=0;"))
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert world.guard._tty >= 0
 
 
@@ -503,8 +506,7 @@ def test_a_stop_of_a_run_that_obeys(world: Guarded) -> None:
 def test_a_stop_before_the_loop_runs_ends_the_supervisors_question(world: Guarded) -> None:
     world.after(0.5, lambda: world.call(b'{"ask": "stop"}\n'))
     world.after(0.7, lambda: world.call(b'{"ask": "stop"}\n'))
-    world.after(0.9, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(0.9) == 0
     assert world.signals == [("supervisor", signal.SIGTERM)]  # once
     assert world.told() == SWITCH_OFF
     assert world.words[Word.STOP] == StopRequest.OFF
@@ -542,8 +544,7 @@ def test_nonsense_and_another_user_are_not_answered_and_stop_nothing(
     if not may_ask:
         monkeypatch.setattr(elmo_guard, "may_ask", lambda peer: False)
     caller = world.call(said)
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert world.words[Word.STOP] == StopRequest.NONE
     with contextlib.suppress(ConnectionResetError):
         assert caller.recv(100) == b""
@@ -554,8 +555,7 @@ def test_who_asks_anything_else_is_told_whose_the_line_is(world: Guarded, ask: s
     caller = world.call(json.dumps({"ask": ask}).encode() + b"\n")
     answered = []
     world.after(0.5, lambda: answered.append(caller.makefile().read()))  # the connection is closed: read to its end
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert answered == [json.dumps({"supervisor_pid": SUPERVISOR_PID}) + "\n"]
     assert (world.words[Word.STOP], world.signals) == (StopRequest.NONE, [])
     assert world.guard._callers == []
@@ -563,16 +563,14 @@ def test_who_asks_anything_else_is_told_whose_the_line_is(world: Guarded, ask: s
 
 def test_a_caller_who_has_gone_holds_nobody_up(world: Guarded) -> None:
     world.call(b'{"ask": "stop"}\n').close()
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert world.words[Word.STOP] == StopRequest.OFF
 
 
 def test_four_callers_wait_for_their_turn(world: Guarded) -> None:
     world.started()
     callers = [world.call(b'{"ask": "who"}\n') for _ in range(4)]
-    world.after(1.0, lambda: world.say({"state": "off"}))
-    assert world.run() == 0
+    assert world.run_until_off(1.0) == 0
     assert [caller.recv(100) for caller in callers] == 4 * [b'{"supervisor_pid": 4711}\n']
 
 

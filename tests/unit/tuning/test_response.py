@@ -528,6 +528,18 @@ def test_a_light_joint_is_not_turned_round_by_its_excitation() -> None:
     assert largest_peak_Nm(shipped("precise", joint__inertia_kgm2=0.2)) == pytest.approx(1.6)
 
 
+def carrier_of(run: Any = None, note: Any = lambda _: None) -> Any:
+    return SimpleNamespace(run=run, output=SimpleNamespace(note=note))
+
+
+def ended(fault: Fault = Fault.FOLLOWING_ERROR, value: float = 0.1, torque_Nm: float = 0.0) -> Carried:
+    """A motion that the fault has ended on the way."""
+    log = new(LogRecord, 100)
+    log.phase, log.command_torque_Nm = AxisPhase.TRACKING, torque_Nm
+    log.desired_position_rad = np.linspace(0.0, 0.05, len(log))
+    return Carried(log, fault, FaultText("happened", "cause", "next"), "", value)
+
+
 @pytest.mark.parametrize(
     ("fault", "value", "torque_Nm", "weak"),
     [
@@ -550,12 +562,9 @@ def test_the_next_law_follows_on_one_that_is_too_weak_alone(
     def run(config: Any, *_: Any, **__: Any) -> Carried:
         laws.append((config.control.kp, config.control.feed_forward))
         assert config.limits.torque_max_Nm == 55.0
-        log = new(LogRecord, 100)
-        log.phase, log.command_torque_Nm = AxisPhase.TRACKING, torque_Nm
-        log.desired_position_rad = np.linspace(0.0, 0.05, len(log))
-        return Carried(log, fault, FaultText("happened", "cause", "next"), "", value)
+        return ended(fault, value, torque_Nm)
 
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
+    carrier = carrier_of(run)
     before = with_break_away(shipped("precise"), 20.0)
     with pytest.raises(TooQuick if fault == Fault.VELOCITY_LIMIT else MotionFault, match=fault.name):
         response_by_any_law(before, 8, carrier, 55.0)
@@ -581,15 +590,13 @@ def test_a_light_joint_that_swings_fast_and_then_stands_gets_the_stiffest_law(
 
     def run(config: Any, *_: Any, **__: Any) -> Carried:
         laws.append(config.control.kp)
-        log = new(LogRecord, 100)
         weak = stands and config.control.kp == 100.0
-        log.phase, log.command_torque_Nm = AxisPhase.TRACKING, 0.0 if weak else pushed_Nm
-        fault = Fault.FOLLOWING_ERROR if weak else Fault.LIMIT_CYCLE
-        return Carried(log, fault, FaultText("happened", "cause", "next"), "", value)
+        return ended(Fault.FOLLOWING_ERROR if weak else Fault.LIMIT_CYCLE, value, 0.0 if weak else pushed_Nm)
 
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     with pytest.raises(MotionFault, match="FOLLOWING_ERROR" if pushed_Nm else "LIMIT_CYCLE"):
-        response_by_any_law(with_break_away(shipped("precise", joint__inertia_kgm2=0.5), 20.0), 8, carrier, 55.0)
+        response_by_any_law(
+            with_break_away(shipped("precise", joint__inertia_kgm2=0.5), 20.0), 8, carrier_of(run), 55.0
+        )
     assert laws == [1600.0, 100.0, 3200.0][: 3 if stands and not pushed_Nm else 2]
 
 
@@ -600,17 +607,14 @@ def test_a_light_soft_joint_gets_gains_that_suit_its_file() -> None:
     def run(config: Any, *_: Any, **__: Any) -> Carried:
         laws.append((config.control.kp, config.control.feed_forward))
         assert passes(config)
-        log = new(LogRecord, 100)
-        log.phase = AxisPhase.TRACKING
-        return Carried(log, Fault.FOLLOWING_ERROR, FaultText("happened", "cause", "next"), "", 0.1)
+        return ended()
 
     notes: list[str] = []
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=notes.append))
     light = shipped(
         "realistic", joint__inertia_kgm2=0.21, reducer__motor_inertia_kgm2=0.095, reducer__damping_Nmspr=2.5
     )
     with pytest.raises(TooWeak):
-        response_by_any_law(with_break_away(light, 10.0), 8, carrier)
+        response_by_any_law(with_break_away(light, 10.0), 8, carrier_of(run, notes.append))
     assert [feed for _, feed in laws] == ["desired", "desired"]
     assert laws[0][0] == 100.0
     assert laws[1][0] > 300.0  # that of the file
@@ -626,13 +630,10 @@ def test_a_stiffer_law_follows_only_where_the_gate_lets_it(name: str, kps: list[
 
     def run(config: Any, *_: Any, **__: Any) -> Carried:
         laws.append(config.control.kp)
-        log = new(LogRecord, 100)
-        log.phase = AxisPhase.TRACKING
-        return Carried(log, Fault.FOLLOWING_ERROR, FaultText("happened", "cause", "next"), "", 0.1)
+        return ended()
 
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     with pytest.raises(TooWeak):
-        response_by_any_law(without_friction(shipped(name)), 8, carrier)
+        response_by_any_law(without_friction(shipped(name)), 8, carrier_of(run))
     assert laws == kps
 
 
@@ -652,7 +653,7 @@ def test_more_torque_than_the_law_holds_ends_with_that_of_the_stage_before(
     for name, fake in (("_stage", stage), ("_refuse_growth", lambda *_: None), ("_better", lambda task, _: task)):
         monkeypatch.setattr(carry_out, name, fake)
     said: list[str] = []
-    carrier: Any = SimpleNamespace(output=SimpleNamespace(note=said.append))
+    carrier = carrier_of(note=said.append)
     known = coherence > GOOD_COHERENCE
     with nullcontext() if known else pytest.raises(error, match="it swings"):
         found, *_ = measured_response(response_task(shipped("precise"), None, 12), carrier)
@@ -679,7 +680,7 @@ def test_a_stage_whose_legs_were_lost_is_measured_once_more(
         return SimpleNamespace(records="records", text=None)
 
     monkeypatch.setattr(carry_out, "response_of", response_of)
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=said.append))
+    carrier = carrier_of(run, said.append)
     task = response_task(shipped("precise"), None, AS_IT_FITS.legs)
     with pytest.raises(DataError, match="must be at least 4") if lost == 2 else nullcontext():
         found, records, plan = carry_out._stage(task, carrier, 1.0, 2)
@@ -696,9 +697,8 @@ def test_a_stage_whose_log_could_not_be_written_is_not_moved_once_more() -> None
         runs.append(title)
         raise DataError("runs: cannot be written: No space left on device")
 
-    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=lambda _: None))
     with pytest.raises(DataError, match="No space left"):
-        carry_out._stage(response_task(shipped("precise"), None, AS_IT_FITS.legs), carrier, 1.0, 2)
+        carry_out._stage(response_task(shipped("precise"), None, AS_IT_FITS.legs), carrier_of(run), 1.0, 2)
     assert len(runs) == 1
 
 
