@@ -16,7 +16,7 @@ from jointctl.hil.faults import FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments import judge as judge_module
-from jointctl.tools.experiments.campaign import campaign_joint, run_campaign
+from jointctl.tools.experiments.campaign import Campaign, campaign_joint, run_campaign
 from jointctl.tools.experiments.fault_scenarios import (
     STEPS_THAT_MOVE,
     BEFORE_s,
@@ -102,9 +102,8 @@ def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
 
 
 def test_workers_sweep_as_well(sweep: tuple[Config, LockstepJoint]) -> None:
-    found, _, _ = run_campaign(
-        load_config(CONFIGS / "sweep_virtual.toml"), 9, 20, lambda _: None, workers=Workers(2), during="sweep"
-    )
+    campaign = Campaign(load_config(CONFIGS / "sweep_virtual.toml"), 9, "sweep")
+    found, _, _ = run_campaign(campaign, 20, lambda _: None, Workers(2))
     alone = [judge(*sweep, draw_scenario(9, number, "sweep")) for number in range(20)]
     assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
 

@@ -21,7 +21,7 @@ import pytest
 from jointctl.drivers.errors import DataError, JointctlError, UsageError
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments import many_runs
-from jointctl.tools.experiments.campaign import run_campaign
+from jointctl.tools.experiments.campaign import Campaign, run_campaign
 from jointctl.tools.experiments.controller_study import StudySettings, run_study
 from jointctl.tools.experiments.many_runs import Workers, require_protected
 from jointctl.tools.experiments.scenarios import named
@@ -73,7 +73,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 
 def verdicts_of(workers: Workers, count: int, advance: Any = lambda done: None) -> list[tuple[Any, ...]]:
-    found, _, interrupted = run_campaign(load_config(shipped_config("virtual")), 9, count, advance, workers)
+    found, _, interrupted = run_campaign(Campaign(load_config(shipped_config("virtual")), 9), count, advance, workers)
     assert not interrupted
     return [dataclasses.astuple(verdict) for verdict in found]
 
@@ -159,7 +159,7 @@ def test_an_interruption_keeps_what_is_done_and_leaves_the_workers_free(cluster:
         raise KeyboardInterrupt
 
     config = load_config(shipped_config("virtual"))
-    found, _, interrupted = run_campaign(config, 9, 3200, advance, Workers(cluster=cluster.address))
+    found, _, interrupted = run_campaign(Campaign(config, 9), 3200, advance, Workers(cluster=cluster.address))
     assert interrupted
     assert len(found) == 16
     started_s = time.monotonic()

@@ -22,9 +22,8 @@ from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import png
-from jointctl.tools.experiments import campaign as runner
 from jointctl.tools.experiments import judge as judge_module
-from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
+from jointctl.tools.experiments.campaign import Campaign, campaign_figure, rows_by_kind, run_campaign
 from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, Event, draw_scenario, kinds_during
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.experiments.many_runs import Workers
@@ -336,7 +335,7 @@ def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: 
 
 def test_workers_give_the_same_verdicts_as_one_process(config: Config, lockstep: LockstepJoint, tmp_path: Path) -> None:
     done: list[float] = []
-    found, _, interrupted = runner.run_campaign(load_config(CONFIG), 9, 40, done.append, workers=Workers(2))
+    found, _, interrupted = run_campaign(Campaign(load_config(CONFIG), 9), 40, done.append, Workers(2))
     assert not interrupted
     assert done[-1] == 40.0
     alone = [judge(config, lockstep, draw_scenario(9, number)) for number in range(40)]

@@ -38,24 +38,26 @@ _kept = threading.local()  # of a worker: the joint of the campaign that it work
 
 
 @dataclass(frozen=True)
-class Scenarios:
-    """Some of a campaign: `numbers` of its seed; it is sent to a worker."""
+class Campaign:
+    """What its scenarios are drawn and judged by; it is sent to the workers."""
 
     config: Config | ArmConfig
     seed: int
-    during: During
-    pairs: bool
-    numbers: tuple[int, ...]
+    during: During = "run"
+    pairs: bool = False  # two faults in each scenario
     place: PlaceStep | None = None  # during a tune
 
+    def scenario(self, number: int) -> Scenario | ArmScenario:
+        """The one with this number."""
+        if isinstance(self.config, ArmConfig):
+            return draw_arm_scenario(self.config, self.seed, number, pairs=self.pairs)
+        return draw_scenario(self.seed, number, self.during, pairs=self.pairs)
 
-def scenario_of(
-    config: Config | ArmConfig, seed: int, number: int, during: During, *, pairs: bool = False
-) -> Scenario | ArmScenario:
-    """Scenario `number` of the campaign with this seed."""
-    if isinstance(config, ArmConfig):
-        return draw_arm_scenario(config, seed, number, pairs=pairs)
-    return draw_scenario(seed, number, during, pairs=pairs)
+    def judge(self) -> Callable[[Any], Verdict]:
+        """What judges its scenarios, with a joint that is commissioned here."""
+        if isinstance(self.config, ArmConfig):
+            return partial(judge_arm, LockstepArm(self.config), masses_of(self.config))
+        return partial(judge, *campaign_joint(self.config, self.during), place=self.place)
 
 
 def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
@@ -65,40 +67,25 @@ def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoin
     return config, LockstepJoint(config)
 
 
-def judge_of(config: Config | ArmConfig, during: During, place: PlaceStep | None = None) -> Callable[[Any], Verdict]:
-    """What judges its scenarios."""
-    if isinstance(config, ArmConfig):
-        return partial(judge_arm, LockstepArm(config), masses_of(config))
-    return partial(judge, *campaign_joint(config, during), place=place)
-
-
-def judge_all(some: Scenarios) -> list[Verdict]:
-    """In their order; a worker commissions its joint once."""
-    config, during = some.config, some.during
-    key = (config.arm, config.joints) if isinstance(config, ArmConfig) else (config, during)
+def judge_all(task: tuple[Campaign, range]) -> list[Verdict]:
+    """Scenarios of these numbers, in their order; a worker commissions its joint once."""
+    campaign, numbers = task
+    config = campaign.config
+    key = (config.arm, config.joints) if isinstance(config, ArmConfig) else (config, campaign.during)
     if getattr(_kept, "key", None) != key:
-        _kept.judge = judge_of(config, during, some.place)
+        _kept.judge = campaign.judge()
         _kept.key = key
-    return [_kept.judge(scenario_of(config, some.seed, number, during, pairs=some.pairs)) for number in some.numbers]
+    return [_kept.judge(campaign.scenario(number)) for number in numbers]
 
 
 def run_campaign(
-    config: Config | ArmConfig,
-    seed: int,
-    count: int,
-    advance: Callable[[float], None],
-    workers: Workers = HERE,
-    during: During = "run",
-    place: PlaceStep | None = None,
-    *,
-    pairs: bool = False,
+    campaign: Campaign, count: int, advance: Callable[[float], None], workers: Workers = HERE
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
-    parts = (range(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
-    tasks = (Scenarios(config, seed, during, pairs, tuple(numbers), place) for numbers in parts)
+    tasks = ((campaign, range(first, min(first + AT_ONCE, count))) for first in range(0, count, AT_ONCE))
     try:
         with closing(workers.results(judge_all, tasks)) as results:
             for verdicts in results:
@@ -170,24 +157,22 @@ def table(rows: Sequence[KindRow]) -> Table:
     return shown
 
 
-def violations(
-    config: Config | ArmConfig, verdicts: Sequence[Verdict], seed: int, during: During = "run", *, pairs: bool = False
-) -> list[dict[str, Any]]:
+def violations(campaign: Campaign, verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
     """Everything that is needed to look at each violation again."""
     return [
-        {**asdict(verdict), "scenario": scenario_of(config, seed, verdict.number, during, pairs=pairs).describe()}
+        {**asdict(verdict), "scenario": campaign.scenario(verdict.number).describe()}
         for verdict in verdicts
         if verdict.violations
     ]
 
 
 def write_json(
-    path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, during: During, found: list[dict[str, Any]]
+    path: Path, campaign: Campaign, verdicts: Sequence[Verdict], elapsed_s: float, found: list[dict[str, Any]]
 ) -> None:
     """`found`: as of `violations`."""
     content = {
-        "seed": seed,
-        "during": during,
+        "seed": campaign.seed,
+        "during": campaign.during,
         "scenarios": len(verdicts),
         "elapsed_s": round(elapsed_s, 1),
         "kinds": [asdict(row) for row in rows_by_kind(verdicts)],

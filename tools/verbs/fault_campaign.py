@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.experiments.campaign import Campaign
     from jointctl.tools.experiments.fault_scenarios import During, PlacedSweep, PlaceStep, TuneStep
     from jointctl.tools.experiments.judge import Verdict
     from jointctl.tools.lockstep import LockstepJoint
@@ -87,6 +88,7 @@ def fault_campaign(
     from jointctl.tools.drawing import save_png
     from jointctl.tools.experiments.arm_campaign import require_arm_fits
     from jointctl.tools.experiments.campaign import (
+        Campaign,
         campaign_figure,
         rows_by_kind,
         run_campaign,
@@ -99,7 +101,6 @@ def fault_campaign(
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_folder
 
-    seed = drawn.seed
     if isinstance(config, ArmConfig):
         if during != "run":
             raise UsageError(f"--{during} is one joint's, and {config.path} is an arm", "give the joint's file")
@@ -107,37 +108,36 @@ def fault_campaign(
     else:
         require_simulated(config, "fault-campaign")
         require_fit(config)
+    campaign = Campaign(config, drawn.seed, during, drawn.pairs, place_of(during))
     if drawn.scenario is not None:
-        return _replay(config, output, drawn, during)
+        return _replay(campaign, drawn.scenario, output)
     if report is not None:
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(drawn.count)) as advance:
-        verdicts, elapsed_s, interrupted = run_campaign(
-            config, seed, drawn.count, advance, workers or HERE, during, place_of(during), pairs=drawn.pairs
-        )
+        verdicts, elapsed_s, interrupted = run_campaign(campaign, drawn.count, advance, workers or HERE)
     rows = rows_by_kind(verdicts)
-    found = violations(config, verdicts, seed, during, pairs=drawn.pairs)
+    found = violations(campaign, verdicts)
     joints = config.joints if isinstance(config, ArmConfig) else (config,)
     figure = campaign_figure(verdicts, max(joint.limits.velocity_max_radps for joint in joints))
     if verdicts:
-        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, during, found)
+        write_json(folder / "campaign.json", campaign, verdicts, elapsed_s, found)
         save_png(figure, folder / "campaign.png")
     data = {
-        "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
+        "scenarios": len(verdicts), "violations": len(found), "seed": drawn.seed, "elapsed_s": round(elapsed_s, 1),
         "interrupted": interrupted, "report": str(folder / "campaign.json"),
     }  # fmt: skip
     output.result(table(rows), data, verdicts)
     if report is not None and verdicts:
-        _write_page(report, config, verdicts, found, figure, seed, output)
-    output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
+        _write_page(report, campaign, verdicts, found, figure, output)
+    output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {drawn.seed}; report in {folder}")
     for item in found[:SHOWN]:
         output.warning(f"scenario {item['number']} ({_told(item)}): {'; '.join(item['violations'])}")
     if found:
         output.error(
             f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
             f"replay one with: {command_line('fault-campaign', config.path)}{'' if during == 'run' else f' --{during}'}"
-            f"{' --pairs' if drawn.pairs else ''} --seed {seed} --scenario {found[0]['number']}",
+            f"{' --pairs' if drawn.pairs else ''} --seed {drawn.seed} --scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS
     return INTERRUPTED if interrupted else 0
@@ -198,9 +198,8 @@ def placed_step(config: Config, joint: LockstepJoint, step: TuneStep, start_rad:
 
 
 def _write_page(
-    path: Path, config: Config | ArmConfig, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Figure,
-    seed: int, output: Output,
-) -> None:  # fmt: skip
+    path: Path, campaign: Campaign, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Figure, output: Output
+) -> None:
     from jointctl.tools.experiments.campaign import rows_by_kind, table
     from jointctl.tools.recording.report_page import (
         Details,
@@ -213,7 +212,7 @@ def _write_page(
     )
 
     tone = "error" if found else "good"
-    said = f"{len(found)} of {len(verdicts)} scenarios violate an invariant, seed {seed}."
+    said = f"{len(found)} of {len(verdicts)} scenarios violate an invariant, seed {campaign.seed}."
     listed = Table(
         ["scenario", "kind", "violations"],
         [(item["number"], _told(item), "; ".join(item["violations"])) for item in found],
@@ -224,18 +223,15 @@ def _write_page(
         Section("By kind of fault", [from_terminal(table(rows_by_kind(verdicts)))]),
         Section("Violations", [listed] if found else []),
         Section("Figures", [points]),
-        Section("Configuration", [Details("Configuration", config.text)]),
+        Section("Configuration", [Details("Configuration", campaign.config.text)]),
     ]
-    write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
+    write_verb_page(path, "Fault campaign", sections, output, subtitle=str(campaign.config.path))
 
 
-def _replay(config: Config | ArmConfig, output: Output, drawn: Drawn, during: During) -> int:
+def _replay(campaign: Campaign, number: int, output: Output) -> int:
     """One scenario, with all that it consists of."""
-    from jointctl.tools.experiments.campaign import judge_of, scenario_of
-
-    assert drawn.scenario is not None
-    chosen = scenario_of(config, drawn.seed, drawn.scenario, during, pairs=drawn.pairs)
-    verdict = judge_of(config, during, place_of(during))(chosen)
+    chosen = campaign.scenario(number)
+    verdict = campaign.judge()(chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
     lines += [

@@ -25,7 +25,7 @@ from rich.text import Text
 
 from jointctl.drivers.errors import DataError
 from jointctl.tools.drawing import require_png, save_png
-from jointctl.tools.experiments.campaign import write_json
+from jointctl.tools.experiments.campaign import Campaign, write_json
 from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, StudySettings, write_csv
 from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output, command_line, width_of
@@ -39,6 +39,7 @@ from jointctl.tools.verbs import study as study_module
 from jointctl.tools.verbs.info import info_table
 from jointctl.tools.verbs.new import new
 from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target
+from tests.configurations import shipped
 from tests.python_process import largest_file
 from tests.sessions import Terminal
 from tests.sessions import output as output_to
@@ -470,7 +471,7 @@ def drawing() -> Figure:
         lambda path: replace_file(path, bytes(5000)),
         lambda path: save_png(drawing(), path),
         lambda path: write_csv(StudyResult(("paper",), PLANTS, False), path),
-        lambda path: write_json(path, 1, [], 0.0, "run", [{"kind": "x" * 5000}]),
+        lambda path: write_json(path, Campaign(shipped(), 1), [], 0.0, [{"kind": "x" * 5000}]),
         lambda path: SweepFile.create(path, 121.0, 0.1, "plan", {"more": "x" * 5000}),
     ],
 )  # fmt: skip
