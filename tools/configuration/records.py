@@ -99,6 +99,15 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     return constants
 
 
+def table_constants(config: Config, table: np.ndarray, duration_s: float, start_position_rad: float) -> Any:
+    """As `axis_constants`, for `duration_s` along `table`, once, instead of the configured motion."""
+    constants = axis_constants(config, table, start_position_rad=start_position_rad)
+    trajectory = constants[0].trajectory
+    trajectory.kind, trajectory.repeats = TrajectoryKind.TABLE, 0
+    trajectory.table_rows, trajectory.duration_s = len(table), duration_s
+    return constants
+
+
 def _fill_own_loop(axis: AxisConstants, config: Config) -> None:
     """What a drive gets that closes its position or velocity loop itself."""
     sent, record = config.drive.sent_with_target(config.loop.rate_Hz), axis.velocity_command

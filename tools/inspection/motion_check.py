@@ -19,7 +19,7 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, text_Nm, text_radps
-from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.analysis.margin_gate import chatters, passes
 from jointctl.tools.configuration.config import Config
@@ -30,7 +30,7 @@ from jointctl.tools.configuration.conversions import (
     velocity_of_a_count_radps,
 )
 from jointctl.tools.configuration.drive_section import require_torque
-from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
+from jointctl.tools.configuration.records import APPROACH_MIN_S, table_constants
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.session.fault_words import FaultText
@@ -211,10 +211,8 @@ class CheckMotion:
         """`AxisConstants` of the check along `table`."""
         config, plan, start_rad = self.config, self.plan, report.start_position_rad
         hold = config.changed(sequence__approach_s=APPROACH_MIN_S)
-        constants = axis_constants(hold, table, start_position_rad=start_rad)
+        constants = table_constants(hold, table, float(table[-1, 0]), start_rad)
         axis = constants[0]
-        axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
-        axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
         axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
         axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
         axis.limits.frozen_max_rad, axis.limits.frozen_ahead_rad = STANDING_WAY * plan.travel_rad, 0.0

@@ -27,12 +27,12 @@ from jointctl.drivers.errors import (
 )
 from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault
 from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.hil.lockstep import TRUE_WARMTH_degC
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
+from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, table_constants
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
@@ -325,12 +325,8 @@ def approach_time_s(config: Config, start_rad: float, middle: float) -> float:
 
 def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMotion) -> Any:
     """`AxisConstants` for the motion (already about its middle) in the mode that the drive was set to."""
-    constants = axis_constants(config, motion.table, start_position_rad=report.start_position_rad)
+    constants = table_constants(config, motion.table, motion.duration_s, report.start_position_rad)
     axis = constants[0]
-    axis.trajectory.kind = TrajectoryKind.TABLE
-    axis.trajectory.repeats = 0
-    axis.trajectory.table_rows = len(motion.table)
-    axis.trajectory.duration_s = motion.duration_s
     axis.sequence.approach_s = approach_time_s(config, report.start_position_rad, float(motion.table[0, 1]))
     if report.commands_velocity:
         axis.command_kind = CommandKind.VELOCITY

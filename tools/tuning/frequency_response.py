@@ -29,12 +29,12 @@ from scipy import signal, stats
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DataError, UsageError, text_Nm, text_radps
-from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.analysis.gains import LEAST_DAMPING
 from jointctl.tools.analysis.linear_loop import two_masses
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import TWIST_SHARE, period_s, static_friction_Nm, turning_of
-from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.records import table_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
 from jointctl.tools.session.plan import Placed, joint_lines, limits_line, remark_lines
 from jointctl.tools.sweeping.carry_out import approach_time_s, with_mode
@@ -321,10 +321,8 @@ class ResponseMotion:
         config, start_rad = self.config, self._start_rad(report)
         table = self.table
         table[:, 1] += start_rad
-        constants = axis_constants(config, table, start_position_rad=report.start_position_rad)
+        constants = table_constants(config, table, float(table[-2, 0]), report.start_position_rad)
         axis = constants[0]
-        axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
-        axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-2, 0])
         axis.sequence.approach_s = approach_time_s(config, report.start_position_rad, start_rad)
         return Placed(constants, table, tuple(self._envelope(report, start_rad, float(axis.sequence.approach_s))))
 

@@ -28,7 +28,7 @@ from scipy.special import ndtr
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import text_Nm, text_radps
-from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
@@ -38,7 +38,7 @@ from jointctl.tools.configuration.conversions import (
     static_frictions_Nm,
 )
 from jointctl.tools.configuration.found_values import Found, rounded
-from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
+from jointctl.tools.configuration.records import APPROACH_MIN_S, table_constants
 from jointctl.tools.session.plan import Placed, joint_lines, remark_lines
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.frequency_response import motor_fed, room_rad
@@ -121,10 +121,8 @@ class PreslidingMotion:
         first = 1.0 if start_rad < 0.5 * (limits.position_min_rad + limits.position_max_rad) else -1.0
         table, _ = self._table(start_rad, first)
         at_once = config.changed(sequence__approach_s=APPROACH_MIN_S)
-        constants = axis_constants(at_once, table, start_position_rad=start_rad)
+        constants = table_constants(at_once, table, float(table[-1, 0]), start_rad)
         axis = constants[0]
-        axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
-        axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
         axis.limits.frozen_max_rad, axis.limits.frozen_ahead_rad = FROZEN_STRETCHES * self.stretch_rad, 0.0
         axis.limits.swing.hunting_rad = 0.0  # the spring pushes it to and fro on purpose
         way_rad = first * REACH * self.stretch_rad
