@@ -23,6 +23,13 @@ SLOW_LOOP = {  # 100 Hz: gains for that rate, and limits for a busy computer
     "virtual__initial_position_rad": 0.02,
 }  # fmt: skip
 
+KALMAN: dict[int, dict[str, Any]] = {  # keys of [control] for encoders of so many bits: docs/law.md, coarse encoders
+    bits: {"velocity_filter": "kalman", "velocity_cutoff_Hz": cutoff_Hz, "observer_radps": observer, "kp": kp, "kv": kv}
+    for bits, cutoff_Hz, observer, kp, kv in (
+        (14, 40.0, 40.0, 2500.0, 100.0), (15, 50.0, 50.0, 3000.0, 110.0), (16, 80.0, 60.0, 3600.0, 120.0),
+    )
+}  # fmt: skip
+
 
 def shipped(name: str = "virtual", **changes: Any) -> Config:
     """One of `configs`, with `section__key=value` changed."""

@@ -79,6 +79,7 @@ from jointctl.tools.verbs import tune_steps  # noqa: E402
 from jointctl.tools.verbs.tune import TuneOptions  # noqa: E402
 from jointctl.tools.verbs.tune_steps import STEPS, Tune  # noqa: E402
 from tests.bench.flexible_study import ADAPTATION, Row, runs_of, table  # noqa: E402
+from tests.configurations import KALMAN  # noqa: E402
 from tests.joint_sizes import Size  # noqa: E402
 from tests.joint_sizes import joint as joint_of  # noqa: E402
 
@@ -325,11 +326,6 @@ def bristles_row(kept: dict[str, Any], virtual: Virtual) -> dict[str, Any]:
     return row
 
 
-KALMAN: dict[int, dict[str, float]] = {  # docs/law.md, coarse encoders; by bits
-    14: {"velocity_cutoff_Hz": 40.0, "observer_radps": 40.0, "kp": 2500.0, "kv": 100.0},
-    15: {"velocity_cutoff_Hz": 50.0, "observer_radps": 50.0, "kp": 3000.0, "kv": 110.0},
-    16: {"velocity_cutoff_Hz": 80.0, "observer_radps": 60.0, "kp": 3600.0, "kv": 120.0},
-}
 SHIPPED = LuGre(stiffness_Nmprad=8e4, damping_Nmspr=200.0)
 MOTIONS_s, MOTIONS_FROM_s = 50.0, 20.0
 COMPARED: tuple[Scenario, ...] = ("reversals", "point_to_point", "multi_sine", "sine")
@@ -341,7 +337,7 @@ def laws_of(job: Tune) -> dict[str, Control]:
     if bits not in KALMAN:
         return {"tuned": job.chosen_gains("precise", "tracking").control.model_copy(update={"learning": None})}
     precise = load_config(shipped_config("precise")).control
-    kalman = {**KALMAN[bits], "velocity_filter": "kalman", "feed_forward_lead_s": "auto", "learning": None}
+    kalman = {**KALMAN[bits], "feed_forward_lead_s": "auto", "learning": None}
     laws = {"plain": kalman, "adapting": {**kalman, "adaptation": ADAPTATION}}
     return {name: changed(precise, changes, name) for name, changes in laws.items()}
 

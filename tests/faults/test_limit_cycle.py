@@ -15,18 +15,12 @@ from jointctl.tools.configuration.sections import Hold
 from jointctl.tools.experiments.scenarios import controller_constants, named
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
-from tests.configurations import shipped
+from tests.configurations import KALMAN, shipped
 
 LIMIT_Nm = 60.0
 NEAR_LIMIT_Nm = 57.0  # a torque that reaches it on both sides swings between its limits
 SWING_CYCLES = 300  # between the two sides
 WITHIN_CYCLES = 1000
-KALMAN: dict[int, dict[str, Any]] = {  # of docs/law.md, for these encoders
-    bits: {"velocity_filter": "kalman", "velocity_cutoff_Hz": cutoff_Hz, "observer_radps": observer, "kp": kp, "kv": kv}
-    for bits, cutoff_Hz, observer, kp, kv in (
-        (14, 40.0, 40.0, 2500.0, 100.0), (15, 50.0, 50.0, 3000.0, 110.0), (16, 80.0, 60.0, 3600.0, 120.0),
-    )
-}  # fmt: skip
 
 
 def carry_out(

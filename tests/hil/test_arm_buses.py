@@ -20,7 +20,7 @@ from jointctl.hil.virtual_bus import VirtualBusHub, default_socket_path
 from jointctl.tools.configuration.arm import load_arm
 from jointctl.tools.experiments.judge import POWERED
 from jointctl.tools.virtual_joint import arm_plant_of, new_devices
-from tests.hil.test_arm_run import NAMES, OFF, ArmBench
+from tests.hil.test_arm_run import NAMES, OFF, ArmBench, powered_together
 from tests.python_process import eventually
 from tests.real_time_joint import schedule_compiled
 
@@ -77,9 +77,7 @@ def test_three_joints_on_two_buses_move_together(arm: TwoBuses) -> None:
     assert spread["count"] > 1000
     logs = arm.logs()
     assert any("SYNC of all buses within" in event.text for event in logs[0].events)
-    together = np.stack([log.records.phase for log in logs])
-    powered = (together >= AxisPhase.APPROACH) & (together <= AxisPhase.RAMPING)
-    assert np.all(powered.all(axis=0) == powered.any(axis=0))  # torque begins and ends in the same cycle
+    assert powered_together(logs)
 
 
 @pytest.mark.parametrize("file", ["arm", "elbow", "wrist"])

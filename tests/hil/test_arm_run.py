@@ -80,6 +80,13 @@ class ArmBench:
         return [read_run_log(max(self.bench.folder.glob(f"runs/*.{name}.mcap"))) for name in NAMES]
 
 
+def powered_together(logs: list[Any]) -> bool:
+    """Whether torque begins and ends in the same cycle."""
+    together = np.stack([log.records.phase for log in logs])
+    powered = (together >= AxisPhase.APPROACH) & (together <= AxisPhase.RAMPING)
+    return bool(np.all(powered.all(axis=0) == powered.any(axis=0)))
+
+
 @pytest.fixture
 def arm(bench: Any) -> ArmBench:
     return ArmBench(bench)
@@ -98,9 +105,7 @@ def test_demo_moves_three_joints_and_leaves_a_log_of_each(bench: Any) -> None:
     for log in logs:
         assert np.ptp(log.records.position_rad[log.records.phase == AxisPhase.TRACKING]) > 0.1
         assert log.records.drive_state[-1] == DriveState.OFF
-    together = np.stack([log.records.phase for log in logs])
-    powered = (together >= AxisPhase.APPROACH) & (together <= AxisPhase.RAMPING)
-    assert np.all(powered.all(axis=0) == powered.any(axis=0))  # torque begins and ends in the same cycle
+    assert powered_together(logs)
 
 
 @pytest.mark.parametrize("joint", ["arm", "elbow"])

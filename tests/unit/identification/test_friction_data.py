@@ -216,7 +216,7 @@ def test_decimal_commas_byte_order_mark_and_no_header(tmp_path):
     body = "".join(f"{v:.2f};{math.copysign(0.25, v):.2f}\n".replace(".", ",") for v in SPEEDS)
     data = read_friction_data(write_foreign(tmp_path, "\ufeffspeed;torque\n" + body), FOREIGN)
     assert data.velocity_radps == pytest.approx(SPEEDS)
-    told = ForeignFormat(**{**FOREIGN.__dict__, "velocity_column": "1", "torque_column": "2"})
+    told = replace(FOREIGN, velocity_column="1", torque_column="2")
     assert len(read_friction_data(write_foreign(tmp_path, body), told).velocity_radps) == len(SPEEDS)
 
 
@@ -248,7 +248,7 @@ def test_nothing_is_guessed_about_other_peoples_data(tmp_path, change, message):
     path = write_foreign(tmp_path, text)
     read_friction_data(path, FOREIGN)
     with pytest.raises(UsageError, match=message):
-        read_friction_data(path, ForeignFormat(**{**FOREIGN.__dict__, **change}))
+        read_friction_data(path, replace(FOREIGN, **change))
 
 
 def test_a_table_without_mapping_lists_its_columns(tmp_path):
@@ -292,17 +292,9 @@ def test_a_run_log_is_no_table_of_plateaus(tmp_path):
 )
 def test_what_a_table_of_plateaus_has_no_column_for_is_refused(tmp_path, change, flag):
     path = write_foreign(tmp_path, "speed,torque\n" + "".join(f"{0.1 * k},{k}\n" for k in range(-20, 21) if k))
-    given = ForeignFormat(
-        velocity_column="speed",
-        torque_column="torque",
-        velocity_unit="rad/s",
-        side="joint",
-        torque_side="joint",
-        ratio=50,
-    )
-    read_friction_data(path, given)
+    read_friction_data(path, FOREIGN)
     with pytest.raises(UsageError, match=f"{flag} does not apply to plateaus"):
-        read_friction_data(path, replace(given, **change))
+        read_friction_data(path, replace(FOREIGN, **change))
 
 
 # --- Torques next to zero, and numbers beyond all measure, in a table of friction: a result or one line ---

@@ -111,13 +111,19 @@ def test_virtual_drives_of_ones_own_do_not_follow_the_environment(
     assert {joint.bus.bitrate_bitps for joint in axes_of(source.config).joints} == {bitrate_bitps}
 
 
+def live_motor(**parts: Any) -> Any:
+    """One with nothing but these parts."""
+    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
+    vars(motor).update(parts)
+    return motor
+
+
 @pytest.mark.parametrize("by", ["", "jointctl stop"])
 def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
     """A stop switches the drive off at once: the loop may see that before it has read the request."""
     ended = SimpleNamespace(motion_fault=lambda: MotionFault("DRIVE_NOT_ENABLED (9): it is off", "check the wiring"))
-    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
-    motor._process, motor._over, motor._error = os.getpid(), True, None
-    motor.result = SimpleNamespace(faulty=[ended], stopped_by=by)
+    result = SimpleNamespace(faulty=[ended], stopped_by=by)
+    motor = live_motor(_process=os.getpid(), _over=True, _error=None, result=result)
     with pytest.raises(MotionFault) as raised:
         motor._raise()
     assert raised.value.message == "DRIVE_NOT_ENABLED (9): it is off" + (f"; stopped by {by}" if by else "")
@@ -134,12 +140,8 @@ def test_a_fault_that_comes_with_a_stop_names_it(by: str) -> None:
 def test_after_a_stop_the_joint_is_called_off_only_where_its_drive_has_confirmed_it(
     state: str, raised: tuple[type[JointctlError], str]
 ) -> None:
-    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
-    motor._process, motor._over, motor._error, motor._control = os.getpid(), True, None, None
-    motor.result, motor._session = (
-        SimpleNamespace(faulty=[], stopped_by="jointctl stop"),
-        SimpleNamespace(drive_state=state),
-    )
+    result, session = SimpleNamespace(faulty=[], stopped_by="jointctl stop"), SimpleNamespace(drive_state=state)
+    motor = live_motor(_process=os.getpid(), _over=True, _error=None, _control=None, result=result, _session=session)
     kind, text = raised
     with pytest.raises(kind, match=re.escape(text)):
         motor._raise()
@@ -151,8 +153,8 @@ def test_a_session_is_over_even_where_its_bus_cannot_be_given_back() -> None:
     def close() -> None:
         raise OSError("no such file")
 
-    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
-    motor._over, motor._session, motor._bus = False, SimpleNamespace(run=lambda: "done"), SimpleNamespace(close=close)
+    session, bus = SimpleNamespace(run=lambda: "done"), SimpleNamespace(close=close)
+    motor = live_motor(_over=False, _session=session, _bus=bus)
     with pytest.raises(OSError, match="no such file"):
         motor._run()
     assert (motor._over, motor.result) == (True, "done")
@@ -160,8 +162,8 @@ def test_a_session_is_over_even_where_its_bus_cannot_be_given_back() -> None:
 
 def test_a_session_whose_start_was_interrupted_finds_that_it_is_to_end() -> None:
     """Python may be interrupted in `Thread.start` with the thread on its way, not yet known by its number."""
-    motor: Any = live_joint.LiveMotor.__new__(live_joint.LiveMotor)
-    motor._over, motor._thread, motor._control = False, threading.Thread(), Control(StopSignals(wake=lambda: None))
+    control = Control(StopSignals(wake=lambda: None))
+    motor = live_motor(_over=False, _thread=threading.Thread(), _control=control)
     motor._end()
     with pytest.raises(KeyboardInterrupt):
         motor._control.signals.leave_if_asked()  # before anything is sent

@@ -445,20 +445,18 @@ def test_kept_records_without_room_name_their_folder(tmp_path: Path) -> None:
         kept.append(sample_records(5000))
 
 
-@pytest.mark.parametrize("content", [b"", b"time_s,position_rad\n", bytes(100)])
-def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "no such file"), (b"\x89MCAP0\r\n", "holds no run log"),
+        *((content, "is not an MCAP file") for content in (b"", b"time_s,position_rad\n", bytes(100))),
+    ],
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
     path = tmp_path / "run.mcap"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"run\.mcap: is not an MCAP file"):
-        read_run_log(path)
-
-
-def test_missing_files_and_foreign_logs_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such file"):
-        read_run_log(tmp_path / "none.mcap")
-    path = tmp_path / "empty.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n")
-    with pytest.raises(DataError, match="holds no run log"):
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=rf"run\.mcap: {words}"):
         read_run_log(path)
 
 
