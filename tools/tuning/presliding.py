@@ -186,6 +186,7 @@ EDGE_SHARE = 0.15  # and where a count without noise is more than the bend: the 
 NOISE_THAT_HELPS = 0.1  # counts
 LEAST_STRETCHES = 10
 SLIPPED = 1.0  # counts, of what the model misses
+MOST_NOISE = 2.0  # counts, beyond which the mean of readings follows the angle to 1e-8 of a count
 _TABLE = 2048  # of a count
 
 
@@ -236,7 +237,7 @@ def stretches_of(
 
 def _mean_reading(noise_counts: float) -> Array:
     """Of an angle of 0 .. 1 counts, `_TABLE` + 1 of them, less that angle."""
-    angle, sigma = np.linspace(0.0, 1.0, _TABLE + 1), max(noise_counts, 1e-6)
+    angle, sigma = np.linspace(0.0, 1.0, _TABLE + 1), min(max(noise_counts, 1e-6), MOST_NOISE)
     reach = math.ceil(5.0 * sigma) + 1
     edges = np.arange(-reach, reach + 1) + 0.5
     return np.asarray(ndtr((angle[:, None] - edges) / sigma).sum(axis=1) - reach - angle)
@@ -244,7 +245,7 @@ def _mean_reading(noise_counts: float) -> Array:
 
 def noise_of(variance: float) -> float:
     """Noise [counts] of readings with that variance at a place that is random within a count."""
-    sizes = np.linspace(0.0, 2.0, 101)
+    sizes = np.linspace(0.0, MOST_NOISE, 101)
     # rounding a noisy reading: variance of noise and of a count, less what the mean makes of the place
     of_sizes = [size * size + 1.0 / 12.0 - float(np.mean(_mean_reading(size)[:-1] ** 2)) for size in sizes]
     return float(np.interp(variance, of_sizes, sizes))

@@ -119,6 +119,22 @@ def test_a_joint_that_slips_has_no_bristles_as_soft_as_that(bits: int, stiffness
     assert measured(stiffness_Nmprad, friction_Nm, resolution_rad, 0.3, 1) is not None
 
 
+def test_a_fine_encoder_takes_no_more_memory_than_a_coarse_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 24 bit on a motor with 1 : 100 bristles bend by 6e4 counts; as noise of the readings they took 10 GB."""
+    ndtr, sizes = presliding.ndtr, list[int]()
+
+    def counted(values: np.ndarray) -> np.ndarray:
+        sizes.append(values.size)
+        assert values.size < 100_000
+        return np.asarray(ndtr(values))
+
+    monkeypatch.setattr(presliding, "ndtr", counted)
+    found = measured(8e4, (19.0, 17.0), TURN_rad / (100 * 2**24), 0.3, 1)
+    assert sizes
+    assert found is not None
+    assert found.stiffness_Nmprad == pytest.approx(8e4, rel=0.1)
+
+
 def test_too_few_places_say_nothing() -> None:
     assert measured(8e4, (19.0, 19.0), 1e-5, 0.0, 1, places=9) is None
     assert measured(8e4, (19.0, 19.0), 1e-5, 0.0, 1, places=10) is not None
