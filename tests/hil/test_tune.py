@@ -50,7 +50,7 @@ from jointctl.tools.verbs import tune_steps
 from jointctl.tools.verbs.response import ResponseOptions, response
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions, tune
-from jointctl.tools.verbs.tune_report import envelope
+from jointctl.tools.verbs.tune_report import _shown, envelope
 from jointctl.tools.verbs.tune_steps import Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.bench.tune_ensemble import scaled
@@ -373,6 +373,15 @@ def test_gains_that_track_worse_than_the_old_ones_are_named(tmp_path: Path, afte
     job._take_verification({"after": {"rmse_mrad": after}, "before_refused": "too soft"})
 
 
+def test_an_unstable_loop_has_no_margins_in_the_table() -> None:
+    """Its sensitivity of inf and its gain margin of 1 read as figures of a loop that runs."""
+    config = load_config(shipped_config("precise"))
+    for factor, words in ((1.0, "1.7"), (4.0, "unstable")):
+        found = margins(loop_settings(config.changed(control__kp=factor**2 * 3600.0, control__kv=factor * 120.0))[0])
+        assert _shown(found, "sensitivity_peak", ".1f") == words
+    assert _shown(None, "sensitivity_peak", ".1f") == "-"
+
+
 def test_all_problems_of_a_step_are_told_with_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def problems(_: Tune) -> None:
         raise ConfigurationProblems(["one", "other"])
@@ -446,6 +455,38 @@ def test_steps_that_mean_nothing_are_refused(tmp_path: Path, monkeypatch: pytest
     (path.with_suffix(".tune") / "steps.json").write_text(damaged)
     with pytest.raises(DataError, match=r"steps\.json"):
         resumed(path, load_config(path))
+
+
+@pytest.mark.parametrize(
+    ("step", "kept"),
+    [
+        ("response", {}), ("response", None), ("friction", {}), ("bristles", {}), ("gains", {"control": {"kp": -1.0}}),
+        ("verification", {}),
+    ],
+)  # fmt: skip
+def test_a_step_that_means_nothing_is_refused_before_the_file_is_written(
+    tuned: Tuned, tmp_path: Path, step: str, kept: Any
+) -> None:
+    path = tuned.ended_before_its_gains(tmp_path)
+    shutil.copy(tuned.path.with_suffix(".tune") / "steps.json", path.with_suffix(".tune") / "steps.json")
+    change_steps(path, lambda state: state.update({step: kept}))
+    with pytest.raises(DataError, match=rf"steps\.json: the step {step} cannot be read") as raised:
+        tune(load_config(path), outputs()[0], options=TuneOptions(lockstep=True, resume=True))
+    assert raised.value.hint == "without --resume it begins anew"
+    assert path.read_text() == tuned.before.text
+
+
+@pytest.mark.parametrize("name", ["friction.csv", "friction.json"])
+def test_a_measured_friction_that_is_gone_is_missed_before_the_file_is_written(
+    tuned: Tuned, tmp_path: Path, name: str
+) -> None:
+    """The report needs it: the tune ended in an error when the configuration was written already."""
+    path = tuned.ended_before_its_gains(tmp_path)
+    (path.with_suffix(".tune") / name).unlink()
+    with pytest.raises(DataError, match=rf"friction: .*{name}: .* is as it was") as raised:
+        tune(load_config(path), outputs()[0], options=TuneOptions(lockstep=True, resume=True))
+    assert raised.value.hint == "without --resume it begins anew"
+    assert path.read_text() == tuned.before.text
 
 
 def test_a_file_that_was_changed_during_the_tune_is_left_as_it_is(

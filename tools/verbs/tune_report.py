@@ -127,7 +127,7 @@ def _tables(job: Tune) -> tuple[Table, Table]:
         ("phase margin [deg]", "phase_margin_deg", ".1f"), ("gain margin up", "gain_margin_up", ".2f"),
         ("largest |S|", "sensitivity_peak", ".2f"),
     ):  # fmt: skip
-        table.add_row(name, *("-" if one is None else format(getattr(one, key), form) for one in both))
+        table.add_row(name, *(_shown(one, key, form) for one in both))
     before, after = verified.get("before", {}), verified["after"]
     for name, key in (("RMSE [mrad]", "rmse_mrad"), ("peak [mrad]", "peak_mrad"), ("chatter [Nm]", "chatter_Nm")):
         shown = [f"{one[key]:.4g}" if key in one else one.get("fault", "refused") for one in (before, after)]
@@ -148,9 +148,10 @@ def write_report(job: Tune, values: list[list[Any]]) -> None:
     data = {**job.state, "values": values}
     output.result(fitted)
     output.result(loop, data)
+    measured = job.found_friction
     assert job.response is not None
+    assert measured is not None
     gains = job.gains or job.chosen_gains(job.options.law, job.options.objective)
-    measured = job.found_friction or job.identified()
     used = {word: direction.index for word, direction in measured.directions.items()}
     curve = fit_figure(measured.data, measured.branches, used, "Friction at the motor", identified=measured)
     pictures: list[Any] = [
@@ -188,6 +189,12 @@ def _margins_or_none(config: Config) -> Margins | None:
         return margins(loop_settings(config)[0])
     except ConfigurationError:
         return None
+
+
+def _shown(found: Margins | None, key: str, form: str) -> str:
+    if found is None:
+        return "-"
+    return format(getattr(found, key), form) if found.stable else "unstable"
 
 
 def trade_off_figure(found: ChosenGains, title: str) -> Figure:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
@@ -146,12 +145,11 @@ class Tune:
         """The steps alone."""
         self._open()
         for name in STEPS:
-            step: Callable[[], Any] = getattr(self, f"_step_{name}")
             done = name in self.state
             self.carrier.output.note(f"{name}: done before" if done else name)
             try:
                 if not done:
-                    self.state[name] = step()
+                    self.state[name] = getattr(self, f"_step_{name}")()
                     self._save()
                 getattr(self, f"_take_{name}", lambda _: None)(self.state[name])
             except JointctlError as error:
@@ -159,7 +157,14 @@ class Tune:
                 kept += f", {self.folder} has the steps before" if self.state else ""
                 seen = error.message.removeprefix(f"{name}: ")
                 error.message = f"{name}: {seen}; {one_line(kept)}"
+                if done and isinstance(error, DataError):
+                    error.hint = ANEW
                 raise
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                if not done:
+                    raise
+                why = f"the step {name} cannot be read: {one_line(repr(error))[:120]}"
+                raise DataError(f"{self.folder / STATE}: {why}", ANEW) from error
         if self.options.refine:
             self._refine()
 
@@ -319,14 +324,12 @@ class Tune:
     # --- 3. gravity, of the same motion ---
 
     def _step_gravity(self) -> dict[str, Any]:
-        kept = self.state["response"]
-        return {**kept["gravity"], "found": kept["sure"]}
+        return {**self.state["response"]["gravity"], "found": self.state["response"]["sure"]}
 
     def _take_gravity(self, kept: dict[str, Any]) -> None:
         none = "none that is certain" if kept["half_Nm"] else "not looked for: the legs of the response are too short"
-        self.carrier.output.note(
-            f"  {kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm" if kept["found"] else f"  {none}"
-        )
+        found = f"{kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm"
+        self.carrier.output.note(f"  {found if kept['found'] else none}")
         if kept["found"]:
             self.config = with_values(self.config, self.gravity_values())
 
@@ -368,11 +371,10 @@ class Tune:
                 self.carrier.output.note(f"  {error.message}: once more without the slowest plateaus")
             finally:
                 seconds += command.file.elapsed_s if command.file is not None else 0.0
-        static = static_friction_Nm(self.config)
         return {
             "section": section_values(found.branches["positive"], found.branches["negative"]),
-            "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model, "static_before": static,
-            "seconds": seconds,
+            "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model,
+            "static_before": static_friction_Nm(self.config), "seconds": seconds,
         }  # fmt: skip
 
     def _sweep(self, command: Sweep) -> None:
@@ -399,6 +401,7 @@ class Tune:
         return friction_of(self.folder / "friction.csv", moved_Nm, self.config.joint.reduction_ratio)
 
     def _take_friction(self, kept: dict[str, Any]) -> None:
+        self.found_friction = self.found_friction or self.identified()  # for the report
         self.carrier.output.note(f"  {kept['points']} plateaus, RMSE {1e3 * kept['rmse_Nm']:.3g} mNm at the motor")
         self.config = with_friction(self.config, kept["section"])
 
@@ -526,8 +529,9 @@ class Tune:
         return self._verified(self.config, "verification without learning")
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
-        rmse = {when: kept[when]["rmse_mrad"] for when in ("before", "after") if "rmse_mrad" in kept.get(when, {})}
-        ended = f"; the file as it was: {kept['before']['fault']}" if "fault" in kept.get("before", {}) else ""
+        before, after = kept.get("before", {}), kept["after"]
+        rmse = {when: one["rmse_mrad"] for when, one in (("before", before), ("after", after)) if "rmse_mrad" in one}
+        ended = f"; the file as it was: {before['fault']}" if "fault" in before else ""
         self.carrier.output.note(f"  RMSE {', '.join(f'{when} {one:.4f} mrad' for when, one in rmse.items())}{ended}")
         if rmse.get("after", 0.0) > WORSE * rmse.get("before", math.inf):
             self.carrier.output.warning(f"the old gains track better; {self.folder / 'before.toml'} has them")
@@ -544,8 +548,7 @@ class Tune:
 
     def before_on_found(self) -> Config:
         """The law as it was, on everything that was found."""
-        second = self.original.joint_encoder
-        return self.config.changed(control=self.original.control, joint_encoder=second)
+        return self.config.changed(control=self.original.control, joint_encoder=self.original.joint_encoder)
 
     def _verified(self, config: Config, title: str) -> dict[str, Any]:
         return verified(self.carrier, config, self.verifying, self.config, title, ALLOWED_FAULTS.get(title, ()))
