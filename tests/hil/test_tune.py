@@ -756,6 +756,9 @@ def test_what_cannot_be_is_refused_before_anything_moves(tmp_path: Path) -> None
     with pytest.raises(ConfigurationError, match=r"is 8 times drive.rated_torque_Nm \(=0.5\): one of them is wrong"):
         tune(load_config(wrong), output, options=TuneOptions(lockstep=True))
     assert not (tmp_path / "wrong.tune").exists()
+    over = written(tmp_path / "over.toml", "precise", trajectory__duration_s=0.001)
+    with pytest.raises(UsageError, match=r"trajectory.duration_s \(=0.001\) must be 0 or at least 0.5"):
+        tune(load_config(over), output, options=TuneOptions(lockstep=True))
     with pytest.raises(DataError, match=r"steps.json: cannot be read"):
         tune(load_config(path), output, options=TuneOptions(lockstep=True, resume=True))
     with pytest.raises(UsageError, match=r"--legs \(=2\) must be in \[8..100\]"):

@@ -38,7 +38,7 @@ from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lin
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
-TRAVEL_OF_RANGE = 0.25  # at most, of the position limits' range, where a soft reducer takes more
+TRAVEL_OF_RANGE = 0.25  # at most, of the position limits' range, unless the encoder is too coarse for that
 LONGER = 1.3  # from one travel that is tried to the next
 REACH = 2.5  # times the travel: where the position limits of the check are
 VELOCITY_MAX_radps = 0.5
@@ -119,11 +119,12 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     resolutions = [abs(joint_rad_per_count(config))]
     if config.joint_encoder is not None:
         resolutions.append(math.tau / config.joint_encoder.counts_per_turn)
-    travel = min(max(TRAVEL_rad, TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
+    of_range = TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)
+    travel = min(max(min(TRAVEL_rad, of_range), TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
     steps_radps = COUNTS_IN_VELOCITY * velocity_of_a_count_radps(config)
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
     plan = CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
-    most = max(travel, min(TRAVEL_MAX_rad, TRAVEL_OF_RANGE * (limits.position_max_rad - limits.position_min_rad)))
+    most = max(travel, min(TRAVEL_MAX_rad, of_range))
     least_Nm = LEAST_FRICTIONS * static_Nm + plan.gravity_Nm if static_Nm and not given else plan.torque_Nm
     while not passes(config_of_check(config, plan)):
         if plan.travel_rad < most:
@@ -188,6 +189,13 @@ class CheckMotion:
         """`ConfigurationError` if the joint stands too near to a limit."""
         limits, travel_rad = self.config.limits, self.plan.travel_rad
         low, high = limits.position_min_rad + travel_rad, limits.position_max_rad - travel_rad
+        if low > high:
+            raise ConfigurationError(
+                f"limits.position_min_rad (={limits.position_min_rad:g}) and position_max_rad "
+                f"(={limits.position_max_rad:g}) must be at least {2.0 * travel_rad:.3g} rad apart for the check, "
+                f"{travel_rad:.3g} rad to either side of where the joint stands",
+                "wider limits.position_*, or more counts_per_turn",
+            )
         if not low <= start_position_rad <= high:
             raise ConfigurationError(
                 f"the joint stands at {start_position_rad:.4f} rad; the check moves it by up to {travel_rad:g} rad to "

@@ -181,7 +181,7 @@ class ShownConsent(TerminalConsent):
 # --- The motion that shows what was found ---
 
 
-VERIFY_s = 30.0
+VERIFY_s, LEAST_VERIFY_s = 30.0, 0.5
 VERIFY_FROM_s = 5.0
 STARTING_s = 1.0  # of a period, in which the first one has the error of the start
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps, in the friction step: a soft reducer swings about the speed
@@ -207,13 +207,17 @@ class VerifyingMotion(ConfiguredMotion):
 
 
 def verifying_motion(config: Config) -> Trajectory:
-    """That of the configuration, `VERIFY_s` at most.
+    """That of the configuration, `VERIFY_s` at most; `UsageError` for one that is over before it is seen.
 
     Where its approach would leave the limits from one of their ends: back and forth over its range, as fast, at rest at
     both ends, which the approach from wherever the joint stands does not pass.
     """
     limits, table = config.limits, trajectory_table(config)
     seconds = min(config.trajectory.duration_s or VERIFY_s, VERIFY_s)
+    if seconds < LEAST_VERIFY_s:
+        raise UsageError(
+            f"trajectory.duration_s (={seconds:g}) must be 0 or at least {LEAST_VERIFY_s:g}, for the run that verifies"
+        )
     motion = config.trajectory.model_copy(update={"duration_s": seconds})
     moving = with_motion(config, motion)
     try:

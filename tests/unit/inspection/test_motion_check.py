@@ -173,6 +173,28 @@ def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused:
         CheckMotion(config, plan).require_start(start_rad)
 
 
+@pytest.mark.parametrize("half_rad", [0.015, 0.03, 0.07])
+def test_a_short_range_takes_a_quarter_of_it(tmp_path: Path, half_rad: float) -> None:
+    """The usual 0.04 rad to either side fitted nowhere in it: "needs [0.01..-0.01]"."""
+    limits = {"limits__position_min_rad": 1.0 - half_rad, "limits__position_max_rad": 1.0 + half_rad}
+    config = config_with(tmp_path).changed(**limits, virtual__initial_position_rad=1.0 + 0.4 * half_rad)
+    plan = make_plan(config, None)
+    assert plan.travel_rad == pytest.approx(0.5 * half_rad)
+    CheckMotion(config, plan).require_start(1.0 + 0.4 * half_rad)
+    findings, records, fault = checked(config)
+    assert fault is Fault.NONE
+    assert findings["direction"].status == OK
+    assert findings["friction"].numbers["break_away_Nm"] == pytest.approx(19.06, rel=0.2)
+    assert np.max(np.abs(records.position_rad - 1.0)) < half_rad
+
+
+def test_a_range_that_a_coarse_encoder_does_not_tell_is_refused_with_its_width(tmp_path: Path) -> None:
+    config = config_with(tmp_path, encoder__counts_per_turn=4096)
+    config = config.changed(limits__position_min_rad=-0.05, limits__position_max_rad=0.05)
+    with pytest.raises(ConfigurationError, match=r"position_max_rad \(=0.05\) must be at least 0.184 rad apart"):
+        CheckMotion(config, make_plan(config, None)).require_start(0.0)
+
+
 def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Path) -> None:
     fine = make_plan(config_with(tmp_path), None)
     config = config_with(tmp_path, encoder__counts_per_turn=4096)
