@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError, blamed, text_Nm
+from jointctl.drivers.errors import ConfigurationError, MarginError, MotionFault, UsageError, blamed, text_Nm
 from jointctl.firmware_py.states import CommandKind, Encoders
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
@@ -80,13 +80,17 @@ def _show(
 ) -> int:  # fmt: skip
     """The table and what it leaves out; then the refusals, as `run` has them."""
     from jointctl.tools.analysis.loop_report import not_modelled, outside_payload_range, save_loop_figure
-    from jointctl.tools.analysis.margin_gate import learning_of, refusal, refuse_chatter, refuse_diverging_learning
+    from jointctl.tools.analysis.margin_gate import learning_of
     from jointctl.tools.verbs.bench_drive import bench_of
 
-    settings, table = analysis.settings, _table(analysis)
+    settings = analysis.settings
+    learning, warnings = learning_of(config, settings), _warnings(config)
+    refused = _refused(config, analysis, learning, allow_low_margin=allow_low_margin)
+    if refused is not None and analysis.verdict != TOO_SMALL:
+        analysis = replace(analysis, verdict=refused.message.partition(":")[0])
+    table = _table(analysis)
     for row in bench_of(config).check_rows(config):
         table.add_row(*row)
-    learning, warnings = learning_of(config, settings), _warnings(config)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         value += "" if learning.worst_factor < 1.0 else ": diverges"
@@ -108,12 +112,27 @@ def _show(
         output.note(f"not in this analysis: {text}")
     for text in outside_payload_range(config, settings):
         output.warning(text)
-    if analysis.verdict == TOO_SMALL:
-        raise refusal(settings, analysis.margins, analysis.min_phase_margin_deg, analysis.remedies)
-    if not allow_low_margin:
-        refuse_chatter(config, settings)
-    refuse_diverging_learning(learning)
+    if refused is not None:
+        raise refused
     return 0
+
+
+def _refused(
+    config: Config, analysis: LoopCheck, learning: Convergence | None, *, allow_low_margin: bool
+) -> MarginError | None:
+    """The first reason why `run` would not enable this loop."""
+    from jointctl.tools.analysis.margin_gate import refusal, refuse_chatter, refuse_diverging_learning
+
+    settings = analysis.settings
+    if analysis.verdict == TOO_SMALL:
+        return refusal(settings, analysis.margins, analysis.min_phase_margin_deg, analysis.remedies)
+    try:
+        if not allow_low_margin:
+            refuse_chatter(config, settings)
+        refuse_diverging_learning(learning)
+    except MarginError as error:
+        return error
+    return None
 
 
 def _warnings(config: Config) -> list[str]:

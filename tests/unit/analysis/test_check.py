@@ -19,7 +19,7 @@ from jointctl.tools.analysis.linear_loop import CONTROLLERS, loop_settings
 from jointctl.tools.analysis.loop_report import not_modelled
 from jointctl.tools.analysis.margin_gate import coarsest, require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.conversions import joint_rad_per_count
 from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
@@ -441,7 +441,6 @@ def test_a_remedy_does_for_every_joint() -> None:
 
 def test_learning_is_judged_with_the_worst_joint() -> None:
     from jointctl.tools.analysis.margin_gate import learning_of
-    from jointctl.tools.configuration.config import Learning
 
     good = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
     for learning, converges in ((good, True), (good.model_copy(update={"error_gain_ps2": 60000.0}), False)):
@@ -491,6 +490,22 @@ def test_a_torque_that_does_not_hold_the_joint_is_no_chatter() -> None:
     with pytest.raises(MarginError, match=r"friction and gravity need 19\.1 Nm, .* \(=18\) must be more"):
         require_margin(config)
     assert require_margin(config, allow_low_margin=True).stable
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({}, "ok"),
+        ({"encoder__counts_per_turn": 2**15}, "the torque would chatter at its limit"),
+        ({"joint__gravity_Nm": 59.0}, "friction and gravity need 78.1 Nm, limits.torque_max_Nm (=60) must be more"),
+        ({"control__learning": Learning(gain=1.0, error_gain_ps2=6e4, lead_cycles=10, half_width_cycles=10)},
+         "iterative learning would diverge"),
+    ],
+)  # fmt: skip
+def test_the_verdict_is_that_of_the_exit_code(changes: dict[str, Any], verdict: str) -> None:
+    """It was "ok" beside an error and exit code 9 where the margins alone are enough."""
+    shown, _, code = run_check(shipped("precise", **changes), json=True)
+    assert (json.loads(shown)["verdict"], code) == (verdict, 0 if verdict == "ok" else 9)
 
 
 KALMAN = {"control__velocity_filter": "kalman", "control__velocity_cutoff_Hz": 60.0}
