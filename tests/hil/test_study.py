@@ -149,7 +149,7 @@ def test_a_file_whose_drive_closes_its_loops_is_not_taken_for_a_law_on_torque(ba
 
 
 def test_a_time_after_the_end_is_refused(base: Config) -> None:
-    with pytest.raises(ConfigurationError, match=r"after_s \(=3\) must be in \[0\.\.3\)"):
+    with pytest.raises(ConfigurationError, match=r"after_s \(=3\) must be in \[0\.\.3\), .*duration_s.*--after"):
         run_study(base, named(("paper",)), StudySettings(plants=1, seed=1, after_s=3.0), workers=Workers(1))
 
 

@@ -485,8 +485,12 @@ def run_study(
 ) -> StudyResult:
     """All runs; `progress` hears how many plants are done.  Ctrl-C ends it early and keeps what is there."""
     after_s, plants = settings.after_s, settings.plants
-    if not 0.0 <= after_s < base.trajectory.duration_s:
-        raise ConfigurationError(f"after_s (={after_s:g}) must be in [0..{base.trajectory.duration_s:g}), the run")
+    run_s = base.trajectory.duration_s
+    if not 0.0 <= after_s < run_s:
+        raise ConfigurationError(
+            f"after_s (={after_s:g}) must be in [0..{run_s:g}), below trajectory.duration_s of {base.path}",
+            "--after, or after_s of the --file",
+        )
     order = tuple(controllers)
     tasks = [
         PlantTask(base, settings.plant, settings.seed, index, order, settings.scenario, after_s)

@@ -599,5 +599,5 @@ class Tune:
         self._about["written"] = hashlib.sha256(content).hexdigest()
         self._save()
         replace_file(path, content, load_config)
-        write_report(self, [[".".join(one.section), one.key, one.value] for one in values])
         self.carrier.output.note(f"written: {path}; as it was: {self.folder / 'before.toml'}")
+        write_report(self, [[".".join(one.section), one.key, one.value] for one in values])

@@ -56,6 +56,7 @@ def test_what_is_said_of_the_file_is_true_wherever_writing_is_cut_off(
     found = path.read_text() != before
     assert found is (during == "the report")
     assert ("has what was found" in err.getvalue()) is found
+    assert (f"written: {path}; as it was: " in err.getvalue()) is found  # also where the report cannot be written
     assert ("is as it was" in err.getvalue()) is not found
     assert not found or (folder / "before.toml").read_text() == before
 
