@@ -13,6 +13,7 @@ from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import InlineTable, Table
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config, ConfigurationProblems
@@ -27,12 +28,27 @@ _OPTIONAL = ("load", "temperature", "angle")  # sections of [friction] that only
 
 
 def document_of(text: str, mark: str = MARK) -> tuple[tomlkit.TOMLDocument, str]:
-    """The document without the lines that begin with `mark`, and how its lines end; `ConfigurationError`."""
+    """The document without the lines that begin with `mark`, and how its lines end; `ConfigurationError`.
+
+    A section that is an inline table or dotted keys, to which no section can be added, becomes one with a heading.
+    """
     kept = "".join(line for line in text.splitlines(keepends=True) if not line.startswith(mark))
     try:
-        return tomlkit.parse(kept), "\r\n" if "\r\n" in kept else "\n"
+        document = tomlkit.parse(kept)
     except TOMLKitError as error:
         raise ConfigurationError(f"not valid TOML: {error}") from None
+    for name in dict.fromkeys(key.key for key, item in document.body if key is not None and _without_heading(item)):
+        values = document[name].unwrap()
+        document.remove(name)
+        document[name] = values
+    return document, "\r\n" if "\r\n" in kept else "\n"
+
+
+def _without_heading(item: Any) -> bool:
+    """Whether it is an inline table, or the dotted keys of a table."""
+    if not isinstance(item, Table):
+        return isinstance(item, InlineTable)
+    return item.is_super_table() and any(not isinstance(one, Table) or _without_heading(one) for one in item.values())
 
 
 def friction_snippet(values: dict[str, Any], remarks: list[str]) -> str:

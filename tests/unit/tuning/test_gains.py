@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from jointctl.tools.analysis.linear_loop import Encoders, LoopSettings, TwoMasse
 from jointctl.tools.analysis.margins import converging, learning_convergence, margins
 from jointctl.tools.configuration.config import Config, Learning
 from jointctl.tools.configuration.conversions import friction_fall_Nmspr
-from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_tuned, with_values
+from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_map, with_tuned, with_values
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.tuning.carry_out import with_slow_observer
@@ -412,6 +413,45 @@ def test_a_section_that_is_put_between_others_stands_apart() -> None:
         "[control]\nkp = 3.0\n\n[log]\nkeep = 2\n", [Found(("control", "adaptation"), "reach", 0.3, "")], {}
     )
     assert text == "[control]\nkp = 3.0\n\n[control.adaptation]\nreach = 0.3\n\n[log]\nkeep = 2\n"
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "control = { kp = 3.0, learning = { gain = 0.5 } }\n\n[log]\nkeep = 2  # runs\n",
+        "control.kp = 3.0\ncontrol.learning.gain = 0.5\n\n[log]\nkeep = 2  # runs\n",
+        "[control]\nkp = 3.0\nlearning.gain = 0.5\n\n[log]\nkeep = 2  # runs\n",
+        "[control]\nkp = 3.0\n\n[control.learning]\ngain = 0.5\n\n[log]\nkeep = 2  # runs\n",
+    ],
+    ids=["inline", "dotted", "dotted inside", "headings"],
+)
+def test_a_section_is_added_to_one_that_is_written_in_any_way(written: str) -> None:
+    """Inline tables were an error of the program itself, dotted keys lost the rest, after all of a tune's motion."""
+    values = [
+        Found(("control", "adaptation"), "reach", 0.3, ""), Found(("control",), "kp", 4.0, ""),
+        Found(("control", "learning"), "lead_cycles", 7, ""),
+    ]  # fmt: skip
+    text = with_tuned(written, values, {"control": ["kp = 4.0"]})
+    found = {"kp": 4.0, "learning": {"gain": 0.5, "lead_cycles": 7}, "adaptation": {"reach": 0.3}}
+    assert tomllib.loads(text) == {"control": found, "log": {"keep": 2}}
+    assert f"[control]\n{TUNED_MARK}kp = 4.0\n" in text
+    assert "keep = 2  # runs\n" in text
+    assert with_tuned(text, values, {"control": ["kp = 4.0"]}) == text
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "reducer = { stiffness_Nmprad = 1e4, map = { direction = 1 } }\n",
+        "reducer = { stiffness_Nmprad = 1e4 }\n",
+        "reducer.stiffness_Nmprad = 1e4\nreducer.map.direction = 1\n",
+        "reducer.stiffness_Nmprad = 1e4\n",
+        "[reducer]\nstiffness_Nmprad = 1e4\n\n[reducer.map]\ndirection = 1\n",
+    ],
+)
+def test_a_map_is_added_to_a_reducer_that_is_written_in_any_way(written: str) -> None:
+    text = with_map(written, {"direction": -1, "zero_counts": 5}, "one motion")
+    assert tomllib.loads(text) == {"reducer": {"stiffness_Nmprad": 1e4, "map": {"direction": -1, "zero_counts": 5}}}
 
 
 def test_a_value_that_stands_under_its_old_name_is_not_written_beside_it(tmp_path: Path) -> None:
