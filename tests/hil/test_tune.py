@@ -712,6 +712,18 @@ def test_it_is_verified_from_wherever_the_joint_stands(
         assert job._verified(config, title)["peak_mrad"] < 5.0
 
 
+@pytest.mark.parametrize(("duration_s", "shown"), [(0.0, "30 s"), (40.0, "30 s"), (10.0, "10 s"), (2.5, "2.5 s")])
+def test_the_time_of_the_run_that_verifies_is_that_which_is_announced(duration_s: float, shown: str) -> None:
+    output, *_ = outputs()
+    config = load_config(shipped_config("precise")).changed(trajectory__duration_s=duration_s)
+    job = Tune(
+        config, TuneOptions(lockstep=True), Carrier(output, TerminalConsent(output, assume_yes=True), None), Path()
+    )
+    (line,) = (line for line in envelope(job) if line.startswith("verify"))
+    assert f"sine of the configuration, {shown}, with" in line
+    assert f"{job.verifying.duration_s:g} s" == shown
+
+
 def test_the_old_gains_are_compared_though_the_friction_of_the_file_was_half_of_what_was_found(tmp_path: Path) -> None:
     """The reading may stand under the true friction: with that of the file it was called frozen, at the very end."""
     output, *_ = outputs()

@@ -17,7 +17,7 @@ from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.recording.report_page import Table as PageTable
-from jointctl.tools.tuning.carry_out import SWEEP_SHARE, VERIFY_s, response_task
+from jointctl.tools.tuning.carry_out import SWEEP_SHARE, response_task
 from jointctl.tools.tuning.frequency_response import bode_figure, speed_and_period
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text
 from jointctl.tools.verbs.map import speeds_in_turn
@@ -51,7 +51,7 @@ def envelope(job: Tune) -> list[str]:
         "minute, where the joint is rigid",
         f"map        once back and forth at {slowly[0]:g} rad/s, where the reducer is soft"
         + (f"; at up to {slowly[-1]:g} where it swings" if slowly[1:] else ""),
-        f"verify     {verified}, {VERIFY_s:.0f} s, with the new and the old gains; before "
+        f"verify     {verified}, {job.verifying.duration_s:.3g} s, with the new and the old gains; before "
         "and after it half a minute of the response, for a joint that has changed",
         f"limits     {inside}, {text_radps(limits.velocity_max_radps)}, {text_Nm(limits.torque_max_Nm)} in every "
         "step; keep the joint free and unloaded, a hand on the emergency stop",
