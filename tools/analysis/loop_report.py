@@ -15,6 +15,7 @@ from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear
 from jointctl.tools.analysis.margin_gate import cascade_of, coarsest
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import (
+    free_torque_Nm,
     law_resolution_rad,
     static_friction_Nm,
     torque_constant_NmpA,
@@ -176,7 +177,7 @@ def _friction_contradiction(config: Config) -> list[str]:
     control, static_Nm = config.control, static_friction_Nm(config)
     behind_rad = FROZEN_SHARE * config.limits.following_error_max_rad
     if static_Nm is not None and config.drive.own_loop() is not CommandKind.TORQUE:
-        return _soft_cascade(config, static_Nm, behind_rad)
+        return [*_overloaded(config), *_soft_cascade(config, static_Nm, behind_rad)]
     if static_Nm is None or control.feed_forward == "none":
         return []
     wrong_Nm = FRICTION_ERROR * static_Nm
@@ -187,6 +188,17 @@ def _friction_contradiction(config: Config) -> list[str]:
         f"control.kp (={control.kp:g}) and observer_radps (={control.observer_radps:g}) push a joint that is "
         f"{behind_rad:g} rad behind with {pushes_Nm:.3g} Nm: friction that is {FRICTION_ERROR:.0%} more than "
         f"[friction] ({wrong_Nm:.3g} Nm) holds it there (POSITION_FROZEN)"
+    ]
+
+
+def _overloaded(config: Config) -> list[str]:
+    """In torque mode the gate refuses it."""
+    limit_Nm, left_Nm = config.limits.torque_max_Nm, free_torque_Nm(config)
+    if left_Nm > 0.0:
+        return []
+    return [
+        f"friction and gravity need {limit_Nm - left_Nm:.3g} Nm, limits.torque_max_Nm (={limit_Nm:g}) must be more: "
+        "where the joint has to lift that, the drive stays at its limit (TORQUE_SATURATED)"
     ]
 
 

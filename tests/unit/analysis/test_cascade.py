@@ -263,6 +263,15 @@ def test_check_has_a_verdict_on_the_drives_loops(minimum_deg: float, verdict: st
     assert f"at least {minimum_deg:g} deg wanted" in row
 
 
+@pytest.mark.parametrize(("gravity_Nm", "too_much"), [(40.0, False), (-40.0, False), (41.5, True), (-41.5, True)])
+def test_gravity_and_friction_that_take_all_torque_are_named(gravity_Nm: float, too_much: bool) -> None:
+    """In torque mode the gate refuses 19 Nm of friction beside them; `check` of CSP said nothing of it."""
+    said = io.StringIO()
+    assert check(shipped("csp", joint__gravity_Nm=gravity_Nm), Output(stdout=io.StringIO(), stderr=said)) == 0
+    words = "warning: friction and gravity need 60.6 Nm, limits.torque_max_Nm (=60) must be more"
+    assert (words in said.getvalue()) is too_much
+
+
 # --- a reducer that is not rigid: what the twist is away from the expected one is taken off the target ---
 @pytest.mark.parametrize(("twist_radps", "swings"), [(60.0, True), (10.0, False)])
 def test_a_twist_correction_that_meets_the_links_resonance_is_refused(twist_radps: float, swings: bool) -> None:
