@@ -153,10 +153,9 @@ class Tune:
                     self._save()
                 getattr(self, f"_take_{name}", lambda _: None)(self.state[name])
             except JointctlError as error:
-                kept = f"{self.original.path} is as it was"
-                kept += f", {self.folder} has the steps before" if self.state else ""
-                seen = error.message.removeprefix(f"{name}: ")
-                error.message = f"{name}: {seen}; {one_line(kept)}"
+                before = f", {self.folder} has the steps before" if self.state else ""
+                kept = one_line(f"{self.original.path} is as it was{before}")
+                error.message = f"{name}: {error.message.removeprefix(f'{name}: ')}; {kept}"
                 if done and isinstance(error, DataError):
                     error.hint = ANEW
                 raise
@@ -438,10 +437,9 @@ class Tune:
                 if moving is motions[-1]:
                     raise
                 self.carrier.output.note(f"  {error.message}: once more, faster")
-        settings, _ = loop_settings(moving)
-        self.found_map = found_map(map_run(moving, carried.records, settings.delay_s + settings.lag_s))
-        encoder = self.config.encoder
-        return self.found_map.values(encoder.direction, encoder.zero_counts)
+        loop, _ = loop_settings(moving)
+        self.found_map = found_map(map_run(moving, carried.records, loop.delay_s + loop.lag_s))
+        return self.found_map.values(self.config.encoder.direction, self.config.encoder.zero_counts)
 
     def _take_map(self, kept: dict[str, Any]) -> None:
         self.carrier.output.note("  measured" if kept else "  none: for a soft reducer, two encoders and 4 motor turns")
@@ -523,9 +521,8 @@ class Tune:
                 raise
             harm = error.message
         self.carrier.output.warning(f"iterative learning is left out: with it {harm}")
-        control = self.config.control.model_copy(update={"learning": None})
-        self.state["gains"]["control"] = control.model_dump(mode="json", exclude_none=True)
-        self.config = self._with_control(control)
+        self.config = self.config.changed(control__learning=None)
+        self.state["gains"]["control"] = self.config.control.model_dump(mode="json", exclude_none=True)
         return self._verified(self.config, "verification without learning")
 
     def _take_verification(self, kept: dict[str, Any]) -> None:
