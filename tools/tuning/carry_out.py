@@ -306,7 +306,7 @@ class ResponseTask:
     sine: Multisine
     pairs: int
     largest_Nm: float
-    chosen: bool = False  # the gains are none of the file
+    gains: str = ""  # OF_FILE or OF_JOINT, where they took the place of the law that was asked for
 
     def motion(self, peak_Nm: float, pairs: int, *, last: bool = False) -> ResponseMotion:
         plan = ResponsePlan(legs_of(self.config, pairs), self.sine, peak_Nm)
@@ -325,18 +325,18 @@ def response_task(config: Config, torque_Nm: float | None, legs: int, law: Respo
         raise UsageError(f"--legs (={legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
     if law is not None and law is not WEAK:
         law = _bearable(config, torque_Nm, law) or (law if config.reducer is None else None)
-    moving, chosen = config_of_response(config, torque_Nm, law), False
+    moving, gains = config_of_response(config, torque_Nm, law), ""
     if law is WEAK and not _passes(moving):
-        moving = config_of_response(config, torque_Nm, None)
+        moving, gains = config_of_response(config, torque_Nm, None), OF_FILE
     if law is None or (law is WEAK and not _passes(moving)):
         suited = _with_chosen_gains(config)
-        chosen = suited is not config
+        gains = OF_FILE if suited is config else OF_JOINT
         if law is None:
             suited = with_slow_observer(suited, BELIEVED, SLOW_OBSERVER_radps)
         moving = config_of_response(suited, torque_Nm, None)
     _, length_s = speed_and_period(moving)
     sine = multisine(moving.loop.rate_Hz, length_s)
-    return ResponseTask(moving, sine, legs // 2, largest_peak_Nm(moving), chosen)
+    return ResponseTask(moving, sine, legs // 2, largest_peak_Nm(moving), gains)
 
 
 @functools.lru_cache(maxsize=4)  # of one command, which asks before and after its question
@@ -418,7 +418,8 @@ def with_slow_observer(config: Config, intervals: Intervals, most_radps: float) 
 
 ALONE, FED, FED_STIFF = "the weak law", "a part of the friction fed forward", "a stiffer law, friction fed forward"
 FED_STIFFEST = "the stiffest law, friction fed forward"
-SUITED = "gains that suit the joint of the file, friction fed forward"  # of a soft reducer, which bears none of these
+OF_FILE, OF_JOINT = "the gains of the file", "gains that suit the joint of the file"  # in place of a law
+SUITED = f"{OF_JOINT}, friction fed forward"  # of a soft reducer, which bears none of these
 _LAWS = {ALONE: WEAK, FED: WEAK, FED_STIFF: STIFF, FED_STIFFEST: STIFFEST, SUITED: None}
 _LITTLE_FRICTION, _MUCH_FRICTION = (ALONE, FED, FED_STIFF, FED_STIFFEST), (FED_STIFF, FED_STIFFEST, FED)
 MUCH_FRICTION_radps2 = 25.0  # torque to break away over the inertia that is believed
@@ -471,23 +472,24 @@ def response_by_any_law(
         believed = _with_inertia(before, HEAVIER * before.joint.inertia_kgm2) if law == FED_STIFFEST else before
         task = task_by(law, believed, legs, torque_Nm, stiffer.get(law))
         task = replace(task, largest_Nm=min(task.largest_Nm, largest_peak_Nm(before)))  # which was announced
-        if law != ALONE:
-            carrier.output.note(f"  law: {law}")
-        if task.chosen:
+        taken = f"{task.gains}, friction fed forward" if task.gains and law != ALONE else task.gains or law
+        if taken != ALONE:
+            carrier.output.note(f"  law: {taken}")
+        if task.gains == OF_JOINT:
             control = task.config.control
             gains = f"kp {control.kp:g}, kv {control.kv:g}, observer {control.observer_radps:g} rad/s"
-            why = "" if law == SUITED else "the gate refuses the gains of the file; "
+            why = "the gate refuses the gains of the file; " if _LAWS[law] is WEAK else ""
             carrier.output.note(f"  {why}for the response: {gains}")
         try:
             return law, task, measured_response(task, carrier)
         except TooWeak as error:
             if not others or (others[0] == SUITED and not _passes(task_by(SUITED, before, legs, torque_Nm).config)):
                 raise
-            carrier.output.note(f"  {error.message}: once more, {others[0]}")
+            carrier.output.note(f"  {error.message}: once more")
         except TooStiff as error:
             if law not in _MUCH_FRICTION[:2] or FED not in others:
                 raise
-            carrier.output.note(f"  {error.message}: once more, {FED}")
+            carrier.output.note(f"  {error.message}: once more")
             stiffest = FED_STIFFEST in others and not isinstance(error, Pushed)  # it may have stuck and slid as fast
             return by(FED, *([FED_STIFFEST] if stiffest else []))
         return by(*others)

@@ -21,6 +21,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -245,15 +246,16 @@ def _peak_of_twist_Nm(config: Config, length_s: float) -> float:
 
         twist = torque / (J_m s^2 + (D s + K) (1 + J_m / J_l))
 
-    The stiffness that is believed may be wrong by margin.stiffness_error.
+    At the ends of margin.payload_range and of the stiffness, by margin.stiffness_error.
     """
     reducer, second = config.reducer, config.joint_encoder
     if reducer is None or second is None:
         return math.inf
     sine, twist_radpNm = multisine(config.loop.rate_Hz, length_s), 0.0
     s = math.tau * 1j * np.arange(len(sine.wave) // 2 + 1) / length_s
-    for factor in (1.0 - config.margin.stiffness_error, 1.0, 1.0 + config.margin.stiffness_error):
-        joint = two_masses(config, reducer, 1.0, factor, False)
+    error = config.margin.stiffness_error
+    for payload, factor in product({1.0, *config.margin.payload_range}, (1.0 - error, 1.0, 1.0 + error)):
+        joint = two_masses(config, reducer, payload, factor, False)
         damping = max(joint.damping_Nmspr, LEAST_DAMPING * joint.critical_Nmspr)
         spring = (damping * s + joint.stiffness_Nmprad) * (1.0 + joint.motor_kgm2 / joint.link_kgm2)
         twist = np.fft.irfft(np.fft.rfft(sine.wave) / (joint.motor_kgm2 * s * s + spring), len(sine.wave))

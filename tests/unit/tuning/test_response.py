@@ -28,7 +28,9 @@ from jointctl.tools.configuration.sections import SineSwitch
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.tuning import carry_out, joint_fit
 from jointctl.tools.tuning.carry_out import (
+    FED,
     FED_STIFF,
+    FED_STIFFEST,
     SUITED,
     Carried,
     HUNTING_Hz,
@@ -621,6 +623,33 @@ def test_a_light_soft_joint_gets_gains_that_suit_its_file() -> None:
     assert f"  law: {SUITED}" in notes
     # and the same for the question whether it is still this joint, whichever law moved it
     assert passes(task_by(FED_STIFF, with_break_away(light, 10.0), 8).config)
+
+
+def test_the_law_that_is_named_is_the_one_that_runs() -> None:
+    """The stiffest law suits this light soft joint, but not for the heavier inertia that it is taken for."""
+    laws: list[float] = []
+
+    def run(config: Any, *_: Any, **__: Any) -> Carried:
+        laws.append(config.control.kp)
+        log = new(LogRecord, 100)
+        log.phase = AxisPhase.TRACKING
+        return Carried(log, Fault.FOLLOWING_ERROR, FaultText("happened", "cause", "next"), "", 0.1)
+
+    notes: list[str] = []
+    carrier: Any = SimpleNamespace(run=run, output=SimpleNamespace(note=notes.append))
+    light = shipped(
+        "realistic", joint__inertia_kgm2=0.2, reducer__motor_inertia_kgm2=0.09, reducer__damping_Nmspr=11.0,
+        reducer__stiffness_Nmprad=4e5, reducer__loop_stiffness_Nmprad=None, reducer__knees_Nm=(),
+        reducer__stiffness_beyond_Nmprad=(), joint_encoder__stiffness_Nmprad=4e5,
+        margin={"loop_delay_s": 0.5e-3, "current_lag_s": 0.5e-3},
+    )  # fmt: skip
+    with pytest.raises(TooWeak):
+        response_by_any_law(with_break_away(light, 10.0), 8, carrier)
+    named = [note.removeprefix("  law: ") for note in notes if note.startswith("  law: ")]
+    assert named == [FED_STIFF, SUITED, FED]
+    assert [laws[0], laws[2]] == [1600.0, 100.0]
+    assert laws[1] not in (1600.0, 3200.0)
+    assert not any(FED_STIFFEST in note or "refuses the gains of the file" in note for note in notes)
 
 
 @pytest.mark.parametrize(("name", "kps"), [("precise", [100.0, 1600.0, 3200.0]), ("realistic", [100.0])])
