@@ -11,12 +11,14 @@ import numpy as np
 
 from jointctl.drivers.errors import text_Nm
 from jointctl.firmware_py.states import CommandKind
+from jointctl.tools.analysis.gains import LEAST_DAMPING
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop, loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import cascade_of, coarsest
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import (
     free_torque_Nm,
     law_resolution_rad,
+    most_twist_s2,
     static_friction_Nm,
     torque_constant_NmpA,
     velocity_of_a_count_radps,
@@ -95,6 +97,7 @@ MOST_RATED, LEAST_RATED = 10.0, 0.02  # of the motor's rated current, that the t
 MOST_A, LEAST_A = 300.0, 0.02  # where no rated current is configured
 FRICTION_ERROR = 0.1  # share by which friction is often wrong
 BEGINS_S = 0.1  # in which a motion begins
+OVERSHOOT = 2.0  # of the twist of a reducer that is hardly damped, over the steady one
 LEAST_STEPS = 2.0  # counts of an encoder in a swing that is not of its own making
 
 
@@ -103,7 +106,7 @@ def contradictions(config: Config) -> list[str]:
     return [
         *rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config),
         *_standstill_contradiction(config), *_friction_contradiction(config), *_stiffness_contradiction(config),
-        *_swing_contradiction(config), *config.drive.coarse_numbers(config),
+        *_braking_contradictions(config), *_swing_contradiction(config), *config.drive.coarse_numbers(config),
     ]  # fmt: skip
 
 
@@ -227,6 +230,40 @@ def _stiffness_contradiction(config: Config) -> list[str]:
         f"reducer.loop_stiffness_Nmprad (={reducer.loop_stiffness_Nmprad:g}) is less than reducer.stiffness_Nmprad "
         f"(={reducer.stiffness_Nmprad:g}): hysteresis makes a small motion stiffer, not softer"
     ]
+
+
+def _braking_contradictions(config: Config) -> list[str]:
+    """A controlled stop against a soft reducer, for the heaviest link and the softest reducer that the gate looks at.
+
+    Braking begins and ends with a jump of the acceleration: the twist comes to twice the steady one, and the link
+    swings afterwards.  Neither gravity nor what the law damps is counted.
+    """
+    reducer, second, sequence = config.reducer, config.joint_encoder, config.sequence
+    if reducer is None:
+        return []
+    brake_radps2, standstill_radps = sequence.brake_radps2, config.limits.standstill_radps
+    twist_s2, found = most_twist_s2(config, reducer), []
+    brakes = f"sequence.brake_radps2 (={brake_radps2:g})"
+    if second is not None and (twist_rad := OVERSHOOT * twist_s2 * brake_radps2) > second.disagreement_max_rad:
+        most_radps2 = 0.99 * second.disagreement_max_rad / (OVERSHOOT * twist_s2)  # room for rounding
+        found.append(
+            f"{brakes} twists the reducer by up to {1e3 * twist_rad:.3g} mrad, more than "
+            f"joint_encoder.disagreement_max_rad (={second.disagreement_max_rad:g}): a stop may end by "
+            f"POSITION_DISAGREEMENT; {most_radps2:.3g} rad/s2 do not twist it by more"
+        )
+    decay_ps = max(0.5 * reducer.damping_Nmspr / (config.margin.payload_range[1] * config.link_kgm2),
+                   LEAST_DAMPING / math.sqrt(twist_s2))  # fmt: skip
+    swings_radps = brake_radps2 * math.sqrt(twist_s2)
+    swings_s = math.log(max(swings_radps / standstill_radps, 1.0)) / decay_ps
+    left_s = sequence.stop_timeout_s - config.limits.velocity_max_radps / brake_radps2
+    if swings_s > left_s:
+        found.append(
+            f"{brakes} leaves the link swinging on its reducer at {swings_radps:.2g} rad/s, and above "
+            f"limits.standstill_radps (={standstill_radps:g}) for {swings_s:.2g} s: sequence.stop_timeout_s "
+            f"(={sequence.stop_timeout_s:g}) leaves {left_s:.2g} s after braking (STOP_TIMEOUT); "
+            "brake less, or allow more time"
+        )
+    return found
 
 
 def _swing_contradiction(config: Config) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -89,3 +90,41 @@ def test_a_soft_loop_is_held_by_friction_that_is_a_little_more(share: float, war
 def test_a_small_motion_is_no_softer(stiffness: float | None, warned: bool) -> None:
     found = contradictions(shipped("realistic", reducer__loop_stiffness_Nmprad=stiffness))
     assert any("hysteresis makes a small motion stiffer" in line for line in found) is warned
+
+
+def of_braking(**changes: Any) -> list[str]:
+    return [line for line in contradictions(shipped("realistic", **changes)) if "sequence.brake_radps2 (=" in line]
+
+
+@pytest.mark.parametrize("changes", [{}, {"margin__payload_range": (0.7, 2.0)}, {"reducer__stiffness_Nmprad": 1.2e4}])
+def test_braking_twists_a_soft_reducer_by_no_more_than_its_encoders_may_differ(changes: dict[str, Any]) -> None:
+    """Twice the steady twist of the heaviest link on the softest reducer, to either side of the limit."""
+    config = shipped("realistic", **changes)
+    assert config.reducer is not None
+    heaviest_kgm2 = config.margin.payload_range[1] * config.link_kgm2
+    softest = (1.0 - config.margin.stiffness_error) * config.reducer.stiffness_Nmprad
+    limit_rad = 2.0 * heaviest_kgm2 * config.sequence.brake_radps2 / softest
+    assert of_braking(**changes, joint_encoder__disagreement_max_rad=1.01 * limit_rad) == []
+    (line,) = of_braking(**changes, joint_encoder__disagreement_max_rad=0.99 * limit_rad)
+    assert f"by up to {1e3 * limit_rad:.3g} mrad" in line
+    assert "POSITION_DISAGREEMENT" in line
+    better_radps2 = float(line.split("POSITION_DISAGREEMENT; ")[1].split(" rad/s2")[0])
+    slower = {"joint_encoder__disagreement_max_rad": 0.99 * limit_rad, "sequence__brake_radps2": better_radps2}
+    assert of_braking(**changes, **slower) == []
+    assert of_braking(**changes, joint_encoder=None, encoder__side="joint") == []
+
+
+@pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])
+def test_a_link_that_swings_on_its_reducer_comes_to_rest_before_a_stop_ends(share: float, warned: bool) -> None:
+    """A belt: 4.1 Hz, 2 % of the critical damping, with one encoder as with two."""
+    belt: dict[str, Any] = {
+        "reducer__stiffness_Nmprad": 1.5e3, "reducer__loop_stiffness_Nmprad": None, "reducer__knees_Nm": (),
+        "reducer__stiffness_beyond_Nmprad": (), "reducer__damping_Nmspr": 0.0, "joint_encoder": None,
+    }  # fmt: skip
+    config = shipped("realistic", **belt)
+    omega = math.sqrt(0.7 * 1.5e3 / (1.4 * config.link_kgm2))
+    swings_s = math.log(2.0 / omega / config.limits.standstill_radps) / (0.02 * omega)
+    timeout_s = config.limits.velocity_max_radps / config.sequence.brake_radps2 + share * swings_s
+    lines = of_braking(**belt, sequence__stop_timeout_s=timeout_s)
+    assert ["STOP_TIMEOUT" in line for line in lines] == [True] * warned
+    assert of_braking(**belt, sequence__stop_timeout_s=timeout_s, limits__standstill_radps=2.0 / omega) == []
