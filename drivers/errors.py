@@ -162,6 +162,10 @@ class LimitCycle(MotionFault):
     """The motion was stopped because torque or error swung back and forth instead of settling."""
 
 
+class StoodStill(MotionFault):
+    """The motion was stopped because the reading stood still although the joint was driven."""
+
+
 class DataError(JointctlError):
     """A data file cannot be read, or its content does not allow the asked computation."""
 

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from jointctl.drivers.errors import (
     LimitCycle,
     MarginError,
     MotionFault,
+    StoodStill,
     TooFewPoints,
     UsageError,
 )
@@ -54,7 +56,7 @@ from jointctl.tools.verbs.tune_report import _shown, envelope
 from jointctl.tools.verbs.tune_steps import Tune
 from jointctl.tools.virtual_joint import plant_settings
 from tests.bench.tune_ensemble import scaled
-from tests.configurations import written
+from tests.configurations import shipped, written
 from tests.joint_sizes import Size, joint
 from tests.page_figures import foreign_colours, svgs
 
@@ -563,6 +565,44 @@ def test_slow_plateaus_that_swing_are_left_out(
     todo += [LimitCycle("swings")] * 3
     with pytest.raises(LimitCycle, match="swings"):
         friction_step(tmp_path)._step_friction()
+
+
+@pytest.mark.parametrize(("soft", "slid", "tries"), [(True, True, 3), (True, False, 1), (False, True, 1)])
+def test_slow_plateaus_at_which_a_soft_joint_sticks_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, soft: bool, slid: bool, tries: int
+) -> None:
+    """A reading that never moved is an encoder; a loop over the link's encoder sticks and slides at low speed."""
+    job, seen = friction_step(tmp_path), list[float]()
+    if soft:
+        job.config = job.config.changed(reducer=shipped("realistic").reducer)
+
+    def sticks(self: Tune, command: Sweep) -> None:
+        seen.append(min(abs(point.velocity_radps) for point in command.plan.points))
+        command.file = Mock(done={0} if slid else set(), elapsed_s=1.0)
+        raise StoodStill("stood still")
+
+    monkeypatch.setattr(Tune, "_sweep", sticks)
+    with pytest.raises(StoodStill, match="stood still"):
+        job._step_friction()
+    assert len(seen) == tries
+    assert sorted(seen) == seen
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_plateaus_that_are_all_measured_count_where_the_last_sweep_sticks_at_one_once_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: int
+) -> None:
+    job, measure = friction_step(tmp_path), Tune._sweep
+
+    def swings(self: Tune, command: Sweep) -> None:
+        if min(abs(point.velocity_radps) for point in command.plan.points) > 0.05:  # the last one
+            measure(self, command)
+            command.file = Mock(done=set(range(len(command.plan.points) - missing)), elapsed_s=1.0)
+        raise LimitCycle("swings")
+
+    monkeypatch.setattr(Tune, "_sweep", swings)
+    with pytest.raises(LimitCycle) if missing else nullcontext():
+        assert job._step_friction()["points"] > 30
 
 
 def test_a_tune_chooses_the_law_of_the_paper_where_it_is_wanted(tuned: Tuned, tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ from jointctl.tools.configuration.load import shipped_control
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
 STICKY = (25.0, 1.7, 3.0)  # the same of a joint that friction rules
 STICKY_radps2 = (45.0, 70.0)  # static friction over the inertia: up to the former those above, from the latter on these
-SLIPS = 5.0  # times what kv damps: friction that falls so steeply makes a rigid joint stick and slip at low speed
+SLIPS = 5.0  # times what kv damps: friction that falls so steeply makes a joint stick and slip at low speed
 NOISE_SHARE, SOFT_NOISE_SHARE = 0.03, 0.55 / 60.0  # of limits.torque_max_Nm; of a soft joint
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
@@ -465,14 +465,14 @@ def choose_gains(
 ) -> ChosenGains:
     """With a law for the joint that was identified, which the configuration holds; a second.
 
-    A rigid joint that sticks and slips whatever is fed forward has neither adaptation nor pairing: what adapts takes
-    each slip for friction, and what it feeds forward then throws the joint at the next reversal.
+    A joint that sticks and slips whatever is fed forward, rigid or with the encoder on the link alone, has neither
+    adaptation nor pairing: what adapts takes each slip for friction, and throws the joint at the next reversal.
     """
     law = chosen_law(config, wanted)
     ready = config.model_copy(update={"control": _control(config, law.control())})
     found = _chosen(ready, law, intervals, loop_settings(ready)[0], objective)
-    damped_Nmspr = config.joint.inertia_kgm2 * found.best.settings.kv
-    if config.reducer is None and friction_fall_Nmspr(config) > SLIPS * damped_Nmspr:
+    slips = friction_fall_Nmspr(config) > SLIPS * config.joint.inertia_kgm2 * found.best.settings.kv
+    if slips and (config.reducer is None or law.encoders is Encoders.LINK):
         return replace(found, control=found.control.model_copy(update={"adaptation": None, "observer_paired": False}))
     return found
 

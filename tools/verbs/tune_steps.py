@@ -21,6 +21,7 @@ from jointctl.drivers.errors import (
     LimitCycle,
     MarginError,
     MotionFault,
+    StoodStill,
     TooFewPoints,
     UsageError,
     one_line,
@@ -364,9 +365,13 @@ class Tune:
                 self._sweep(command)
                 found = self.found_friction = self.identified()
                 break
-            except (LimitCycle, TooFewPoints) as error:
-                if command is commands[-1]:
-                    raise
+            except (LimitCycle, StoodStill, TooFewPoints) as error:
+                done, last = command.file.done if command.file is not None else (), command is commands[-1]
+                if last and len(done) == len(command.plan.points) and not isinstance(error, TooFewPoints):
+                    found = self.found_friction = self.identified()  # it was at what had not settled once more
+                    break
+                if last or (isinstance(error, StoodStill) and not (done and self.config.reducer)):
+                    raise  # of a soft joint that has slid no encoder stands still: it sticks at low speed
                 self.carrier.output.note(f"  {error.message}: once more without the slowest plateaus")
             finally:
                 seconds += command.file.elapsed_s if command.file is not None else 0.0

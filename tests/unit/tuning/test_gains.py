@@ -183,6 +183,19 @@ def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_
     assert hardly_damped.phase_margin_deg >= 0.5 * config.margin.min_phase_margin_deg
 
 
+@pytest.mark.parametrize(("stiffness_Nmprad", "adapts"), [(1.2e4, False), (9e4, True)])
+def test_a_loop_over_the_links_encoder_that_is_too_soft_for_the_friction_has_nothing_that_adapts(
+    stiffness_Nmprad: float, adapts: bool
+) -> None:
+    """As that of a rigid joint: what had adapted to the slips threw it ahead by 18 mrad, where it stuck."""
+    fit = replace(fit_of(2.1, 1.8e-3, 1.1, stiffness_Nmprad), tells_link=False)
+    config = known(shipped("realistic", joint_encoder=None, encoder__side="joint"), fit)
+    found = choose_gains(config, fit.intervals(), "link_encoder")
+    damped_Nmspr = config.joint.inertia_kgm2 * found.best.settings.kv
+    assert (friction_fall_Nmspr(config) <= SLIPS * damped_Nmspr) is adapts
+    assert (found.control.adaptation is not None) is adapts
+
+
 @pytest.mark.parametrize(("late_s", "low"), [(1.6e-3, False), (2.4e-3, True)])
 def test_a_soft_joint_with_the_motors_encoder_alone_gets_that_filter_where_it_is_late(late_s: float, low: bool) -> None:
     """A light motor: behind the usual filter kv would be 4, and the error three times as large."""
