@@ -65,7 +65,7 @@ NOISE_SHARE, SOFT_NOISE_SHARE = 0.03, 0.55 / 60.0  # of limits.torque_max_Nm; of
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
 UNSTABLE = 1e3
-KP_OF_KV = 1.5  # of kv^2, for the law of a flexible joint: with less damping a joint a little different is unstable
+KP_OF_KV, LATE_KP_OF_KV = 1.5, 3.0  # of kv^2, for the law of a flexible joint; the latter where late torque limits kv
 LARGEST_OBSERVER_radps = 110.0  # of that law, for the same reason
 LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 LEAST_OBSERVER_radps = 0.1  # a slower one is none, and its pole cannot be distinguished from an unstable one
@@ -118,7 +118,7 @@ class Law:
     control: Callable[[], Control]
     keys: tuple[str, ...]  # of LoopSettings, positive
     spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
-    kp_of_kv: float
+    kp_of_kv: tuple[float, ...]  # of each, the search goes on from the best gains of those before
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     noise_share: float = NOISE_SHARE
@@ -147,7 +147,7 @@ class Law:
             far += math.log(settings.link_cutoff_Hz / _highest_link_cutoff_Hz(settings.cutoff_Hz)) ** 2
         return UNUSUAL * far
 
-    def settings(self, settings: LoopSettings, logarithms: Array) -> LoopSettings:
+    def settings(self, settings: LoopSettings, logarithms: Array, kp_of_kv: float) -> LoopSettings:
         """With these values, to three digits."""
         values: dict[str, Any] = {
             key: float(f"{math.exp(x):.3g}") for key, x in zip(self.keys, logarithms, strict=True)
@@ -156,7 +156,7 @@ class Law:
             values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
             highest_Hz = _highest_link_cutoff_Hz(values["cutoff_Hz"])
             values["link_cutoff_Hz"] = min(values.get("link_cutoff_Hz", math.inf), highest_Hz)
-        values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
+        values["kp"] = float(f"{kp_of_kv * values['kv'] ** 2:.3g}")
         if "observer_radps" in values:
             values["observer_radps"] = max(values["observer_radps"], LEAST_OBSERVER_radps)
         if "q" in values:
@@ -192,26 +192,26 @@ def _highest_link_cutoff_Hz(cutoff_Hz: float) -> float:
 
 _MOTOR_ENCODER = Law(
     "motor_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
-    ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), KP_OF_KV, LARGEST_OBSERVER_radps,
+    ((4.0, 60.0, 6), (12.0, 110.0, 6), (8.0, 450.0, 3)), (KP_OF_KV,), LARGEST_OBSERVER_radps,
     noise_share=SOFT_NOISE_SHARE, ripple_radps=RIPPLE_OF_TWO_radps, encoders=Encoders.MOTOR,
 )  # fmt: skip
 LAWS = {
     "precise": Law(
         "precise", lambda: shipped_control("precise"), ("kv", "observer_radps", "cutoff_Hz"),
-        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), 0.25, QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
+        ((15.0, 300.0, 6), (6.0, 45.0, 6), (80.0, 450.0, 6)), (0.25,), QUICKEST_OBSERVER_radps, USUAL_OBSERVER_radps,
         of_soft=((4.0, 300.0, 8), (6.0, 45.0, 5), (5.0, 450.0, 6)),
     ),
     "paper": Law(
-        "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), 0.25,
+        "paper", lambda: shipped_control("paper"), ("kv", "q"), ((12.0, 120.0, 6), (60.0, 6000.0, 6)), (0.25,),
     ),
     "two_encoders": replace(
         _MOTOR_ENCODER, name="two_encoders", keys=("kv", "observer_radps", "link_cutoff_Hz", "cutoff_Hz"),
         spans=((4.0, 60.0, 6), (12.0, 110.0, 6), (30.0, USUAL_LINK_CUTOFF_Hz, 2), (8.0, 450.0, 3)),
-        sensitivity=2.4, encoders=Encoders.BOTH,  # 2 is far softer where much is late
+        kp_of_kv=(KP_OF_KV, LATE_KP_OF_KV), sensitivity=2.4, encoders=Encoders.BOTH,
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
-        ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), KP_OF_KV, LARGEST_OBSERVER_radps,
+        ((3.0, 40.0, 7), (4.0, 60.0, 6), (5.0, 80.0, 4)), (KP_OF_KV,), LARGEST_OBSERVER_radps,
         noise_share=SOFT_NOISE_SHARE, encoders=Encoders.LINK,
     ),
 }  # fmt: skip
@@ -387,7 +387,7 @@ def latest_s(settings: LoopSettings, intervals: Intervals) -> float:
 
 class _Search:
     def __init__(self, config: Config, law: Law, intervals: Intervals, settings: LoopSettings) -> None:
-        self.law, self.nominal = law, settings
+        self.law, self.nominal, self.kp_of_kv = law, settings, law.kp_of_kv[0]
         self.tried: list[Judged] = []
         period_s = self.nominal.period_s
         self._omega = _frequencies_radps(config, period_s)
@@ -417,11 +417,10 @@ class _Search:
             for alike in (np.equal(sizes, size) for size in sorted(set(sizes)))
         ]
         counts = [law_resolution_rad(config), abs(joint_rad_per_count(config))]
-        two = self.nominal.encoders == Encoders.BOTH
-        self._count_rad = np.array(counts if two else counts[:1])
+        self._count_rad = np.array(counts if settings.encoders == Encoders.BOTH else counts[:1])
 
     def judged(self, logarithms: Array) -> Judged:
-        self.tried.append(self._judge(self.law.settings(self.nominal, logarithms)))
+        self.tried.append(self._judge(self.law.settings(self.nominal, logarithms, self.kp_of_kv)))
         return self.tried[-1]
 
     def _judge(self, settings: LoopSettings) -> Judged:
@@ -519,6 +518,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
         return math.log(one.error) + missed
 
     def best_of(least_error: float | None) -> Judged:
+        search.kp_of_kv = law.kp_of_kv[0]
         if not search.tried:
             for point in product(*(np.geomspace(*span) for span in spans)):
                 search.judged(np.log(point))
@@ -541,8 +541,8 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
 
         for x in law.starts(sorted(search.tried, key=of)):
             best = lowest_from(x, -0.3)
-        for step in _AGAIN:  # a simplex that has shrunk in a curved valley has not found its lowest point
-            best = lowest_from(law.logarithms(best.settings), step)
+        for search.kp_of_kv, step in product(law.kp_of_kv, _AGAIN):  # a simplex that has shrunk in a curved valley has
+            best = lowest_from(law.logarithms(best.settings), step)  # not found its lowest point
         return best
 
     best = best_of(None)

@@ -31,8 +31,9 @@ from jointctl.tools.analysis.gains import (
     steady_joints,
 )
 from jointctl.tools.analysis.linear_loop import Encoders, LoopSettings, TwoMasses, linear_loop, loop_settings
+from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import converging, learning_convergence, margins
-from jointctl.tools.configuration.config import Config, Learning
+from jointctl.tools.configuration.config import Config, Control, Learning
 from jointctl.tools.configuration.conversions import friction_fall_Nmspr
 from jointctl.tools.configuration.found_values import TUNED_MARK, Found, with_map, with_tuned, with_values
 from jointctl.tools.configuration.load import load_config, shipped_config
@@ -169,6 +170,25 @@ def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate(
     assert found.best.settings.observer_radps < 120.0
     assert found.best.noise_Nm < 0.56  # 1.8 Nm were 3 % of this joint's torque
     assert found.control.adaptation is not None
+
+
+def test_a_light_motor_with_late_torque_gets_a_stiffer_loop_with_less_damping(
+    two_encoders: tuple[JointFit, Config, ChosenGains],
+) -> None:
+    """Late torque limits kv, and kp of 3 kv^2 instead of 1.5 leaves a fifth less of the error at the same margins."""
+
+    def stiffness(control: Control) -> float:
+        return control.kp / control.kv**2
+
+    fit = fit_of(1.94, 2.4e-3, 1.5, 2.7e4)
+    config = known(shipped("realistic"), fit)
+    found = choose_gains(config, fit.intervals())
+    assert found.missed == {}
+    assert stiffness(found.control) == pytest.approx(3.0, rel=0.02)
+    assert stiffness(two_encoders[2].control) == pytest.approx(1.5, rel=0.02)
+    softer = [one for one in found.tried if one.stable and one.settings.kp < 2.0 * one.settings.kv**2]
+    assert found.best.error < 0.9 * min(one.error for one in softer if not found.goals.missed(one))
+    require_margin(config.changed(control=found.control))
 
 
 def test_a_soft_joint_with_an_encoder_on_the_link_alone_gets_a_filter_below_its_resonance() -> None:
