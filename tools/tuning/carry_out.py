@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
+from jointctl.drivers.errors import (
+    ConfigurationError,
+    DataError,
+    LimitCycle,
+    MotionFault,
+    StoodStill,
+    UsageError,
+    text_Nm,
+)
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import peak_of, quintic_s, repetition
 from jointctl.hil.canopen.records import PowerState
@@ -101,7 +109,7 @@ class Carried:
 
 def _ended(title: str, carried: Carried) -> MotionFault:
     assert carried.text is not None
-    kind = LimitCycle if carried.fault is Fault.LIMIT_CYCLE else MotionFault
+    kind = {Fault.LIMIT_CYCLE: LimitCycle, Fault.POSITION_FROZEN: StoodStill}.get(carried.fault, MotionFault)
     return kind(f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice)
 
 

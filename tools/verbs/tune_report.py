@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import ConfigurationError, text_Nm, text_radps
+from jointctl.drivers.errors import ConfigurationError, JointctlError, LimitCycle, StoodStill, text_Nm, text_radps
 from jointctl.tools.analysis.gains import ChosenGains
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
 from jointctl.tools.analysis.reducer_map import map_figure
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import friction_fall_Nmspr
 from jointctl.tools.configuration.found_values import Found, rounded
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.identification_report import fit_figure
@@ -29,6 +30,22 @@ if TYPE_CHECKING:
     from jointctl.tools.verbs.tune_steps import Tune
 
 GAINS = ("kp", "kv", "observer_radps", "velocity_cutoff_Hz", "link_cutoff_Hz")  # that are shown
+
+
+def too_soft(job: Tune, error: JointctlError) -> str:
+    """What sticking and slipping may be due to where a soft joint has an encoder on the link alone; else ""."""
+    config, fit = job.config, job.fit
+    behind = fit is not None and fit.flexible and config.encoder.side == "joint"
+    if fit is None or not behind or not isinstance(error, (LimitCycle, StoodStill)):
+        return ""
+    resonance_Hz, kv_1ps = fit.resonance_Hz.value, config.control.kv
+    late_deg, fall_Nmspr = 360.0 * fit.late_s.value * resonance_Hz, friction_fall_Nmspr(config)
+    falls = f", and friction falls by {fall_Nmspr:.3g}" if "friction" in job.state else ""
+    return (
+        f": the encoder on the link alone, behind a resonance at {resonance_Hz:.3g} Hz that is {late_deg:.2g} deg "
+        f"late, leaves kv {kv_1ps:.3g}, which damps {config.joint.inertia_kgm2 * kv_1ps:.3g} Nm s/rad{falls}: so soft "
+        "a loop may stick and slip; an encoder on the motor besides, or a stiffer reducer, allows a stiffer one"
+    )
 
 
 def envelope(job: Tune) -> list[str]:

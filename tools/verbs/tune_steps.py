@@ -88,7 +88,7 @@ from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
-from jointctl.tools.verbs.tune_report import values_of, write_report
+from jointctl.tools.verbs.tune_report import too_soft, values_of, write_report
 from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "bristles", "map", "gains", "verification")
@@ -156,7 +156,8 @@ class Tune:
             except JointctlError as error:
                 before = f", {self.folder} has the steps before" if self.state else ""
                 kept = one_line(f"{self.original.path} is as it was{before}")
-                error.message = f"{name}: {error.message.removeprefix(f'{name}: ')}; {kept}"
+                seen = error.message.removeprefix(f"{name}: ") + too_soft(self, error)
+                error.message = f"{name}: {seen}; {kept}"
                 if done and isinstance(error, DataError):
                     error.hint = ANEW
                 raise

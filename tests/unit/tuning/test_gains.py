@@ -6,13 +6,14 @@ import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import tomlkit
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, LimitCycle, MotionFault, StoodStill
 from jointctl.tools.analysis.gains import (
     _FLEXIBLE,
     LAWS,
@@ -40,6 +41,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.tuning.carry_out import with_slow_observer
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit, values_of_fit
+from jointctl.tools.verbs.tune_report import too_soft
 from jointctl.tools.virtual_joint import plant_settings
 from tests.configurations import shipped
 
@@ -214,6 +216,24 @@ def test_a_loop_over_the_links_encoder_that_is_too_soft_for_the_friction_has_not
     damped_Nmspr = config.joint.inertia_kgm2 * found.best.settings.kv
     assert (friction_fall_Nmspr(config) <= SLIPS * damped_Nmspr) is adapts
     assert (found.control.adaptation is not None) is adapts
+
+
+def test_a_fault_behind_the_links_encoder_names_what_leaves_the_loop_soft() -> None:
+    fit = fit_of(2.1, 1.8e-3, 1.1, 1.2e4)
+    config = known(shipped("realistic", joint_encoder=None, encoder__side="joint", control__kv=6.0), fit)
+    job: Any = SimpleNamespace(config=config, fit=fit, state={"friction": {}})
+    bare: Any = SimpleNamespace(config=config, fit=fit, state={})
+    text = too_soft(job, LimitCycle("swings"))
+    resonance_Hz = fit.resonance_Hz.value
+    late_deg = 360.0 * 1.8e-3 * resonance_Hz
+    assert f"a resonance at {resonance_Hz:.3g} Hz that is {late_deg:.2g} deg late, leaves kv 6" in text
+    assert f"damps 12.6 Nm s/rad, and friction falls by {friction_fall_Nmspr(config):.3g}" in text
+    assert "an encoder on the motor besides" in text
+    assert "falls" not in too_soft(bare, StoodStill("stands"))
+    assert too_soft(job, MotionFault("the joint is another one")) == ""
+    for key, value in (("fit", None), ("fit", replace(fit, flexible=False)), ("config", shipped("realistic"))):
+        other: Any = SimpleNamespace(**{**vars(bare), key: value})
+        assert too_soft(other, LimitCycle("swings")) == ""
 
 
 @pytest.mark.parametrize(("late_s", "low"), [(1.6e-3, False), (2.4e-3, True)])
