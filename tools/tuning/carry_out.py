@@ -25,7 +25,7 @@ from jointctl.drivers.errors import (
     text_Nm,
 )
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
-from jointctl.firmware_py.trajectory import peak_of, quintic_s, repetition
+from jointctl.firmware_py.trajectory import peak_of, quintic_s
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.analysis.gains import BELIEVED, Intervals, latest_s
 from jointctl.tools.analysis.linear_loop import loop_settings
@@ -39,6 +39,7 @@ from jointctl.tools.configuration.sections import MinJerk, Trajectory
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.recording.run_summary import learning_factor
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import run_display
 from jointctl.tools.session.fault_words import FaultText
@@ -191,7 +192,6 @@ class ShownConsent(TerminalConsent):
 
 VERIFY_s, LEAST_VERIFY_s = 30.0, 0.5
 VERIFY_FROM_s = 5.0
-STARTING_s = 1.0  # of a period, in which the first one has the error of the start
 SWEEP_SHARE = 0.7  # of limits.velocity_max_radps, in the friction step: a soft reducer swings about the speed
 
 
@@ -259,29 +259,8 @@ def verified(
     return {
         "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
         "chatter_Nm": float(np.mean(np.abs(np.diff(later.command_torque_Nm)))), "log": carried.log,
-        "seconds": verifying.duration_s, "learning": learning_factor(moving, table, rows),
+        "seconds": verifying.duration_s, "learning": learning_factor(trajectory_constants(moving, table), table, rows),
     }  # fmt: skip
-
-
-def learning_factor(config: Config, table: np.ndarray, rows: Any) -> float | None:
-    """RMS error while learning adds torque, over that of the first period at the same places in it.
-
-    Of the records of TRACKING; None where the motion does not repeat in them, or nothing was learned.
-    """
-    constants = trajectory_constants(config, table)
-    places = np.array([repetition(constants, table, one) for one in rows.trajectory_s]).reshape(-1, 3)
-    squares_rad2, adds = np.asarray(rows.error_rad) ** 2, np.asarray(rows.learned_torque_Nm) != 0.0
-    first_rad2 = later_rad2 = 0.0
-    for epoch in np.unique(places[places[:, 1] > 0.0, 0]):
-        same = places[:, 0] == epoch
-        begin_s, period_s, local_s = rows.trajectory_s[same][0], places[same][0, 1], places[:, 2]
-        started, over = same & (local_s >= min(STARTING_s, 0.25 * period_s)), rows.trajectory_s >= begin_s + period_s
-        first, later = started & ~over, started & over & adds
-        if np.any(first) and np.any(later):
-            order = np.argsort(local_s[first])
-            first_rad2 += np.sum(np.interp(local_s[later], local_s[first][order], squares_rad2[first][order]))
-            later_rad2 += np.sum(squares_rad2[later])
-    return float(np.sqrt(later_rad2 / first_rad2)) if first_rad2 > 0.0 else None
 
 
 # --- The frequency response: short stages that begin small and grow, then the whole one ---

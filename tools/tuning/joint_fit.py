@@ -9,6 +9,7 @@ those of the linearised fit, as wide as its residuals say, and of inertias and d
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -494,3 +495,14 @@ def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
         remark = f"{rounded(most):g}, {CRITICAL_SHARE * 100.0:g} % of the critical damping: more is hysteresis; found: "
         values[-1] = replace(values[-1], value=rounded(most), source=remark + values[-1].source)
     return values
+
+
+def values_of_gravity(kept: Mapping[str, Any]) -> list[Found]:
+    """Of `Gravity` as JSON holds it, with `found`: amplitude and angle without lever, where it is certain."""
+    if not kept["found"]:
+        return []
+    torque, zero = rounded(kept["torque_Nm"]), rounded(kept["zero_rad"])
+    return [
+        Found(("joint",), "gravity_Nm", torque, f"{torque:g} +- {kept['half_Nm']:.2g}, 95 %, legs of the response"),
+        Found(("joint",), "gravity_zero_rad", zero, f"{zero:g}, legs of the response"),
+    ]

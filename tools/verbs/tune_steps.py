@@ -38,7 +38,6 @@ from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
 from jointctl.tools.configuration.found_values import (
     Found,
-    rounded,
     with_break_away,
     with_friction,
     with_sliding,
@@ -82,7 +81,15 @@ from jointctl.tools.tuning.frequency_response import (
     speed_and_period,
     with_torque_limit,
 )
-from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_of, friction_of, gravity_of, values_of_fit
+from jointctl.tools.tuning.joint_fit import (
+    JointFit,
+    fit_from_dict,
+    fit_of,
+    friction_of,
+    gravity_of,
+    values_of_fit,
+    values_of_gravity,
+)
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text, measured_bristles
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS
@@ -287,9 +294,7 @@ class Tune:
         )
         self._require_reducer()
         # for the motions that measure: at low speed a softer law sticks, and no plateau settles
-        gains = self.chosen_gains(self.options.law, "tracking")
-        self._require(gains)
-        self.config = self._with_control(gains.control)
+        self.config = self._with_control(self.chosen_gains(self.options.law, "tracking").control)
         problems = problems_between_sections(self.config)
         if problems:  # the file could not be written at the end
             hint = "the joint is another one than the file says: correct that section, or take it out"
@@ -317,10 +322,17 @@ class Tune:
         return config
 
     def chosen_gains(self, law: str, objective: str) -> ChosenGains:
+        """Those of the joint that was found; `MarginError` where none are stable."""
         assert self.fit is not None
         # a choice before this one may have left out what adapts, for another friction
         config = self.config.changed(control__adaptation=self.original.control.adaptation)
-        return choose_gains(config, self.fit.intervals(), law, objective)
+        gains = choose_gains(config, self.fit.intervals(), law, objective)
+        if not gains.best.stable:
+            raise MarginError(
+                f"no gains of the law {gains.law.name} are stable over the intervals of this joint",
+                "--law; a shorter loop delay; the encoder on the motor",
+            )
+        return gains
 
     # --- 3. gravity, of the same motion ---
 
@@ -332,17 +344,7 @@ class Tune:
         found = f"{kept['torque_Nm']:.3g} +- {kept['half_Nm']:.2g} Nm"
         self.carrier.output.note(f"  {found if kept['found'] else none}")
         if kept["found"]:
-            self.config = with_values(self.config, self.gravity_values())
-
-    def gravity_values(self) -> list[Found]:
-        kept = self.state["gravity"]
-        if not kept["found"]:
-            return []
-        torque, zero = rounded(kept["torque_Nm"]), rounded(kept["zero_rad"])
-        return [
-            Found(("joint",), "gravity_Nm", torque, f"{torque:g} +- {kept['half_Nm']:.2g}, 95 %, legs of the response"),
-            Found(("joint",), "gravity_zero_rad", zero, f"{zero:g}, legs of the response"),
-        ]
+            self.config = with_values(self.config, values_of_gravity(kept))
 
     # --- 4. friction ---
 
@@ -458,7 +460,6 @@ class Tune:
     def _step_gains(self) -> dict[str, Any]:
         self._require_same_joint("before the gains")  # a law that is chosen for another joint may swing
         self.gains = self.chosen_gains(self.options.law, self.options.objective)
-        self._require(self.gains)
         return self._kept(self.gains)
 
     def _require_same_joint(self, when: str) -> None:
@@ -479,14 +480,6 @@ class Tune:
             "missed": gains.missed, "phase_margin_deg": best.phase_margin_deg, "gain_margin": best.gain_margin,
             "sensitivity": best.sensitivity, "noise_Nm": best.noise_Nm,
         }  # fmt: skip
-
-    @staticmethod
-    def _require(gains: ChosenGains) -> None:
-        if not gains.best.stable:
-            raise MarginError(
-                f"no gains of the law {gains.law.name} are stable over the intervals of this joint",
-                "--law; a shorter loop delay; the encoder on the motor",
-            )
 
     def _take_gains(self, kept: dict[str, Any]) -> None:
         self.config = self._with_control(Control.model_validate_json(json.dumps(kept["control"])))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +17,19 @@ from rich.console import Console
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.records import trajectory_constants
+from jointctl.tools.configuration.sections import SineSwitch
 from jointctl.tools.recording import run_summary
 from jointctl.tools.recording.run_summary import (
     TIMES,
     drawn_indices,
     histogram_times,
+    learning_factor,
     save_run_figure,
     summarise,
     summary_table,
 )
+from tests.configurations import shipped
 from tests.run_records import run_records
 
 
@@ -222,3 +228,32 @@ def test_no_peak_is_lost_in_the_figure(count: int) -> None:
     assert {0, count - 1} <= set(drawn)
     assert (values[drawn].min(), values[drawn].max()) == (-7.0, 5.0)
     assert np.all(np.diff(drawn) > 0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "switch_s", "learned", "expected"),
+    [
+        ({}, math.inf, True, 2.0),
+        ({}, 15.0, True, 2.0),  # another sine from then on, of which no whole period was run
+        ({}, math.inf, False, None),
+        ({"frequency_Hz": 0.01}, math.inf, True, None),
+    ],
+)
+def test_what_learning_adds_is_compared_with_the_first_period_at_the_same_places(
+    motion: dict[str, Any], switch_s: float, learned: bool, expected: float | None
+) -> None:
+    """Its error has another place in the period, a start that counts for nothing, and then twice the size."""
+    motion = {f"trajectory__{key}": value for key, value in {"frequency_Hz": 0.1, **motion}.items()}
+    if switch_s < math.inf:
+        motion["trajectory__switch"] = SineSwitch(
+            at_s=switch_s, amplitude_rad=0.1, frequency_Hz=0.05, shift_s=0.0, offset_rad=0.0
+        )
+    config = shipped("precise").changed(trajectory__duration_s=30.0, **motion)
+    time_s = np.arange(0.0, 30.0, 0.01)
+    rows = np.zeros(time_s.size, dtype=[(n, float) for n in ("trajectory_s", "error_rad", "learned_torque_Nm")])
+    later = (time_s >= 10.0) & (time_s < switch_s)
+    rows["trajectory_s"], rows["learned_torque_Nm"] = time_s, later * learned
+    rows["error_rad"] = np.where(time_s < 0.9, 9.0, (1.0 + later) * (2.0 + np.sin(2.0 * np.pi * time_s / 10.0)))
+    table = np.zeros((1, 5))
+    found = learning_factor(trajectory_constants(config, table), table, rows.view(np.recarray))
+    assert found == (None if expected is None else pytest.approx(expected, rel=1e-6))

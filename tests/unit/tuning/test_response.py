@@ -24,7 +24,6 @@ from jointctl.tools.analysis.margin_gate import passes
 from jointctl.tools.configuration.conversions import friction_constants, static_friction_Nm
 from jointctl.tools.configuration.found_values import with_break_away, with_sliding, without_friction
 from jointctl.tools.configuration.records import axis_constants
-from jointctl.tools.configuration.sections import SineSwitch
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.tuning import carry_out, joint_fit
 from jointctl.tools.tuning.carry_out import (
@@ -738,31 +737,3 @@ def test_what_tells_delay_and_lag_apart_is_a_resonance() -> None:
     for name in ("delay_s", "lag_s"):
         assert rigid.values[name].half >= 2.5e-4 > 1.5 * soft.values[name].half
     assert rigid.late_s.half < 1.5e-4
-
-
-@pytest.mark.parametrize(
-    ("motion", "switch_s", "learned", "expected"),
-    [
-        ({}, math.inf, True, 2.0),
-        ({}, 15.0, True, 2.0),  # another sine from then on, of which no whole period was run
-        ({}, math.inf, False, None),
-        ({"frequency_Hz": 0.01}, math.inf, True, None),
-    ],
-)
-def test_what_learning_adds_is_compared_with_the_first_period_at_the_same_places(
-    motion: dict[str, Any], switch_s: float, learned: bool, expected: float | None
-) -> None:
-    """Its error has another place in the period, a start that counts for nothing, and then twice the size."""
-    motion = {f"trajectory__{key}": value for key, value in {"frequency_Hz": 0.1, **motion}.items()}
-    if switch_s < math.inf:
-        motion["trajectory__switch"] = SineSwitch(
-            at_s=switch_s, amplitude_rad=0.1, frequency_Hz=0.05, shift_s=0.0, offset_rad=0.0
-        )
-    config = shipped("precise").changed(trajectory__duration_s=30.0, **motion)
-    time_s = np.arange(0.0, 30.0, 0.01)
-    rows = np.zeros(time_s.size, dtype=[(n, float) for n in ("trajectory_s", "error_rad", "learned_torque_Nm")])
-    later = (time_s >= 10.0) & (time_s < switch_s)
-    rows["trajectory_s"], rows["learned_torque_Nm"] = time_s, later * learned
-    rows["error_rad"] = np.where(time_s < 0.9, 9.0, (1.0 + later) * (2.0 + np.sin(2.0 * np.pi * time_s / 10.0)))
-    found = carry_out.learning_factor(config, np.zeros((1, 5)), rows.view(np.recarray))
-    assert found == (None if expected is None else pytest.approx(expected, rel=1e-6))
