@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jointctl.drivers.canopen.cia import state_text
-from jointctl.drivers.errors import text_Nm, text_radps
+from jointctl.drivers.errors import LimitCycle, MotionFault, StoodStill, text_Nm, text_radps
 from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event
@@ -95,6 +95,12 @@ class FaultText:
     def advice(self) -> str:
         """For the line below what happened."""
         return f"likely cause: {self.cause}; next: {self.next_step}"
+
+
+def motion_fault(fault: Fault, message: str, hint: str) -> MotionFault:
+    """The error for a motion that this ended, of the kind after which a measurement may go on in another way."""
+    kind = {Fault.LIMIT_CYCLE: LimitCycle, Fault.POSITION_FROZEN: StoodStill}.get(fault, MotionFault)
+    return kind(message, hint)
 
 
 @dataclass(frozen=True)

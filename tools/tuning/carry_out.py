@@ -18,9 +18,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import (
     ConfigurationError,
     DataError,
-    LimitCycle,
     MotionFault,
-    StoodStill,
     UsageError,
     text_Nm,
 )
@@ -42,7 +40,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.recording.run_summary import learning_factor
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import run_display
-from jointctl.tools.session.fault_words import FaultText
+from jointctl.tools.session.fault_words import FaultText, motion_fault
 from jointctl.tools.session.plan import ConfiguredMotion, Motion, Placed, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
@@ -110,8 +108,8 @@ class Carried:
 
 def _ended(title: str, carried: Carried) -> MotionFault:
     assert carried.text is not None
-    kind = {Fault.LIMIT_CYCLE: LimitCycle, Fault.POSITION_FROZEN: StoodStill}.get(carried.fault, MotionFault)
-    return kind(f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}", carried.text.advice)
+    message = f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}"
+    return motion_fault(carried.fault, message, carried.text.advice)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, LimitCycle, MotionFault, StoodStill, UsageError
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.sweeping.options import AS_IT_FITS, SweepOptions, check_files
@@ -262,17 +262,15 @@ class Sweep:
                 )
 
     def _raise_fault(self, fault: Fault, text: FaultText | None) -> None:
-        from jointctl.firmware_py.states import Fault
+        from jointctl.tools.session.fault_words import motion_fault
 
         if text is None:
             return
         done = len(self.file.done) if self.file is not None else 0
         points = "1 point is" if done == 1 else f"{done} points are"
         kept = f"{points} in {self.out}" if done else "nothing was measured"
-        kind = {Fault.LIMIT_CYCLE: LimitCycle, Fault.POSITION_FROZEN: StoodStill}.get(fault, MotionFault)
-        raise kind(
-            f"{fault.name} ({int(fault)}): {text.happened}; {kept}", text.advice + ("; then --resume" if done else "")
-        )
+        message = f"{fault.name} ({int(fault)}): {text.happened}; {kept}"
+        raise motion_fault(fault, message, text.advice + ("; then --resume" if done else ""))
 
     def _report(self, stopped: str | None) -> int:
         from jointctl.tools.session import result as drive_end
