@@ -491,9 +491,17 @@ def require_one_joint(task: ResponseTask, plan: ResponsePlan, records: np.recarr
 
 
 def require_same_joint(task: ResponseTask, carrier: Carrier, peak_Nm: float, fit: JointFit, when: str) -> None:
-    """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one."""
+    """A short response at `peak_Nm`, of a joint that was found to be `fit`; `MotionFault` where it is another one.
+
+    Where it moved too fast, at half of that, once.
+    """
     peak_Nm = min(peak_Nm, task.largest_Nm)
-    inertia = fitted_again(_stage(task, carrier, peak_Nm, STAGE_PAIRS, last=True)[0], fit)
+    try:
+        found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS, last=True)
+    except TooQuick as error:
+        carrier.output.note(f"  {error.message}: once more, with {text_Nm(0.5 * peak_Nm, 2)}")
+        found, *_ = _stage(task, carrier, 0.5 * peak_Nm, STAGE_PAIRS, last=True)
+    inertia = fitted_again(found, fit)
     _refuse_another("the response", fit.inertia_kgm2, when, inertia)
     carrier.output.note(f"  the same joint: {inertia.value:.4g} kg m^2 {when}")
 

@@ -737,3 +737,25 @@ def test_what_tells_delay_and_lag_apart_is_a_resonance() -> None:
     for name in ("delay_s", "lag_s"):
         assert rigid.values[name].half >= 2.5e-4 > 1.5 * soft.values[name].half
     assert rigid.late_s.half < 1.5e-4
+
+
+@pytest.mark.parametrize("quick_Nm", [3.0, 1.0])
+def test_the_question_whether_it_is_the_same_joint_is_asked_once_more_with_half_the_torque(
+    monkeypatch: pytest.MonkeyPatch, quick_Nm: float
+) -> None:
+    """A slow joint may spring beyond its velocity limit under the torque under which it did not before."""
+    peaks_Nm: list[float] = []
+
+    def stage(_: Any, __: Any, peak_Nm: float, *___: Any, **____: Any) -> Any:
+        peaks_Nm.append(peak_Nm)
+        if peak_Nm > quick_Nm:
+            raise TooQuick("it moved too fast")
+        return "response", "records", "plan"
+
+    monkeypatch.setattr(carry_out, "_stage", stage)
+    monkeypatch.setattr(carry_out, "fitted_again", lambda found, fit: fit.inertia_kgm2)
+    carrier: Any = SimpleNamespace(output=SimpleNamespace(note=lambda _: None))
+    fit: Any = SimpleNamespace(inertia_kgm2=joint_fit.Estimate(2.0, 0.1))
+    with nullcontext() if quick_Nm > 2.0 else pytest.raises(TooQuick):
+        carry_out.require_same_joint(response_task(shipped("precise"), None, 12), carrier, 4.0, fit, "before the gains")
+    assert peaks_Nm == [4.0, 2.0]
