@@ -8,7 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -27,6 +27,9 @@ from jointctl.drivers.errors import (
     TooFewPoints,
     UsageError,
 )
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault
 from jointctl.tools.analysis.linear_loop import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import margins
@@ -37,14 +40,18 @@ from jointctl.tools.configuration.load import load_config, moved, shipped_config
 from jointctl.tools.configuration.sections import Trapezoid
 from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.output import Output
+from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import TerminalConsent
 from jointctl.tools.tuning.carry_out import (
     ALONE,
     FED_STIFF,
     FED_STIFFEST,
+    Carried,
     Carrier,
+    LearningSwings,
     SLOW_OBSERVER_radps,
     TooWeak,
+    _ended,
     response_by_any_law,
 )
 from jointctl.tools.tuning.joint_fit import fit_of
@@ -311,21 +318,31 @@ def test_a_joint_that_learning_makes_worse_is_tuned_without_it(tmp_path: Path) -
     assert after["rmse_mrad"] < 0.8 * with_learning["rmse_mrad"]
 
 
-SWINGS = LimitCycle("verification: LIMIT_CYCLE (27): torque swung", "lower the gains")
+@pytest.mark.parametrize(("learned_Nm", "kind"), [(0.0, LimitCycle), (0.1, LearningSwings)])
+def test_a_limit_cycle_is_that_of_learning_only_where_it_added_torque(learned_Nm: float, kind: type) -> None:
+    records = new(LogRecord, 10)
+    records.learned_torque_Nm[-1] = learned_Nm
+    error = _ended("verification", Carried(records, Fault.LIMIT_CYCLE, FaultText("it swung", "cause", "next"), ""))
+    assert type(error) is kind
+    assert error.message == "verification: LIMIT_CYCLE (27): it swung"
+    assert error.hint == "likely cause: cause; next: next"
+
+
+SWINGS = "verification: LIMIT_CYCLE (27): torque swung"
 
 
 @pytest.mark.parametrize(
-    ("learns", "outcome", "left_out"),
+    ("outcome", "left_out"),
     [
-        (True, {"rmse_mrad": 0.1, "learning": 0.99}, None),
-        (True, {"rmse_mrad": 0.1, "learning": None}, None),
-        (True, {"rmse_mrad": 0.1, "learning": 1.01}, "the error that repeats was 1.01 times that of"),
-        (True, SWINGS, "verification: LIMIT_CYCLE (27): torque swung"),
-        (False, SWINGS, None),
+        ({"rmse_mrad": 0.1, "learning": 0.99}, None),
+        ({"rmse_mrad": 0.1, "learning": None}, None),
+        ({"rmse_mrad": 0.1, "learning": 1.01}, "the error that repeats was 1.01 times that of"),
+        (LearningSwings(SWINGS, "lower the gains"), SWINGS),
+        (LimitCycle(SWINGS, "lower the gains"), None),  # before it had learned anything
     ],
 )
 def test_learning_that_does_not_help_is_left_out_and_what_remains_is_verified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learns: bool, outcome: Any, left_out: str | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: Any, left_out: str | None
 ) -> None:
     runs: list[bool] = []
 
@@ -338,13 +355,12 @@ def test_learning_that_does_not_help_is_left_out_and_what_remains_is_verified(
     monkeypatch.setattr(Tune, "_verified", verified)
     output, _, err = outputs()
     carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
-    config = load_config(shipped_config("precise"))
-    job = Tune(config if learns else config.changed(control__learning=None), TuneOptions(), carrier, tmp_path)
+    job = Tune(load_config(shipped_config("precise")), TuneOptions(), carrier, tmp_path)
     job.state["gains"] = {"control": {"learning": {}}}
-    if not learns:
+    if isinstance(outcome, LimitCycle) and left_out is None:
         with pytest.raises(LimitCycle):
             job._verified_with_what_helps()
-        assert runs == [False]
+        assert runs == [True]
         return
     found = job._verified_with_what_helps()
     assert found["rmse_mrad"] == (0.1 if left_out is None else 0.2)
@@ -567,16 +583,24 @@ def test_slow_plateaus_that_swing_are_left_out(
         friction_step(tmp_path)._step_friction()
 
 
-@pytest.mark.parametrize(("soft", "slid", "tries"), [(True, True, 3), (True, False, 1), (False, True, 1)])
-def test_slow_plateaus_at_which_a_soft_joint_sticks_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, soft: bool, slid: bool, tries: int
+@pytest.mark.parametrize(
+    ("side", "slid", "resumed", "tries"),
+    [
+        ("joint", True, False, 3), ("joint", False, False, 1),
+        ("joint", True, True, 1),  # what was measured before tells nothing of the encoder now
+        ("motor", True, False, 1), (None, True, False, 1),
+    ],
+)  # fmt: skip
+def test_slow_plateaus_at_which_a_joint_sticks_behind_its_links_encoder_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, side: Any, slid: bool, resumed: bool, tries: int
 ) -> None:
     """A reading that never moved is an encoder; a loop over the link's encoder sticks and slides at low speed."""
     job, seen = friction_step(tmp_path), list[float]()
-    if soft:
-        job.config = job.config.changed(reducer=shipped("realistic").reducer)
+    if side is not None:
+        job.config = job.config.changed(reducer=shipped("realistic").reducer, encoder__side=side)
 
     def sticks(self: Tune, command: Sweep) -> None:
+        command.options = replace(command.options, resume=resumed)
         seen.append(min(abs(point.velocity_radps) for point in command.plan.points))
         command.file = Mock(done={0} if slid else set(), elapsed_s=1.0)
         raise StoodStill("stood still")
@@ -588,20 +612,24 @@ def test_slow_plateaus_at_which_a_soft_joint_sticks_are_left_out(
     assert sorted(seen) == seen
 
 
-@pytest.mark.parametrize("missing", [0, 1])
-def test_plateaus_that_are_all_measured_count_where_the_last_sweep_sticks_at_one_once_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: int
+@pytest.mark.parametrize(
+    ("error", "missing", "counts"), [(LimitCycle, 0, True), (LimitCycle, 1, False), (StoodStill, 0, False)]
+)
+def test_plateaus_that_are_all_measured_count_where_the_last_sweep_swings_at_one_once_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[MotionFault], missing: int, counts: bool
 ) -> None:
+    """Of a rigid joint whose reading stands then, as it does where the encoder is dead, nothing counts."""
     job, measure = friction_step(tmp_path), Tune._sweep
 
     def swings(self: Tune, command: Sweep) -> None:
         if min(abs(point.velocity_radps) for point in command.plan.points) > 0.05:  # the last one
             measure(self, command)
             command.file = Mock(done=set(range(len(command.plan.points) - missing)), elapsed_s=1.0)
+            raise error("swings")
         raise LimitCycle("swings")
 
     monkeypatch.setattr(Tune, "_sweep", swings)
-    with pytest.raises(LimitCycle) if missing else nullcontext():
+    with nullcontext() if counts else pytest.raises(error):
         assert job._step_friction()["points"] > 30
 
 
@@ -686,7 +714,8 @@ def test_gains_that_measure_better_bring_their_own_margins(
 
     def verified(_: Tune, config: Config, title: str) -> dict[str, Any]:
         learning.append(config.control.learning is not None)
-        return {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1, "learning": 1.1}
+        factor = 1.1 if learning[-1] else None
+        return {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1, "learning": factor}
 
     monkeypatch.setattr(Tune, "_verified", verified)
     output, *_ = outputs()
@@ -702,6 +731,25 @@ def test_gains_that_measure_better_bring_their_own_margins(
     assert kept["control"]["kv"] == job.config.control.kv == gains.best.settings.kv
     assert kept["control"]["kv"] == job.state["refinement"]["runs"][-1]["kv"]
     assert kept["phase_margin_deg"] == gains.best.phase_margin_deg
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_gains_with_which_learning_does_harm_are_no_better(
+    tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    path = tuned.ended_before_its_gains(tmp_path)
+
+    def verified(_: Tune, __: Config, title: str) -> dict[str, Any]:
+        refined = title == "refinement"
+        return {"rmse_mrad": 0.1 if refined else 0.2, "learning": factor if refined else 0.5}
+
+    monkeypatch.setattr(Tune, "_verified", verified)
+    output, *_ = outputs()
+    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
+    options = TuneOptions(lockstep=True, refine=True, resume=True)
+    job = Tune(load_config(path), options, carrier, path.with_suffix(".tune"))
+    job.carry_out()
+    assert job.state["verification"]["after"]["rmse_mrad"] == (0.1 if factor < 1.0 else 0.2)
 
 
 @pytest.mark.parametrize(

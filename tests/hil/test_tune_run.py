@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,8 @@ def begun(joint: Any, simulated: Tune, *steps: str) -> Path:
     job._open()
     job.state = {name: simulated.state[name] for name in steps}
     job._save()
+    for measured in simulated.folder.glob("friction.*"):
+        shutil.copy(measured, job.folder)
     return path
 
 

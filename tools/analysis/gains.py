@@ -118,7 +118,7 @@ class Law:
     control: Callable[[], Control]
     keys: tuple[str, ...]  # of LoopSettings, positive
     spans: tuple[tuple[float, float, int], ...]  # of each key, and how many values of it the grid has
-    kp_of_kv: tuple[float, ...]  # of each, the search goes on from the best gains of those before
+    kp_of_kv: tuple[float, ...]  # with each the search goes on from the best gains found with those before
     most_observer_radps: float = math.inf
     usual_observer_radps: float | None = None
     noise_share: float = NOISE_SHARE
@@ -207,7 +207,7 @@ LAWS = {
     "two_encoders": replace(
         _MOTOR_ENCODER, name="two_encoders", keys=("kv", "observer_radps", "link_cutoff_Hz", "cutoff_Hz"),
         spans=((4.0, 60.0, 6), (12.0, 110.0, 6), (30.0, USUAL_LINK_CUTOFF_Hz, 2), (8.0, 450.0, 3)),
-        kp_of_kv=(KP_OF_KV, LATE_KP_OF_KV), sensitivity=2.4, encoders=Encoders.BOTH,
+        kp_of_kv=(KP_OF_KV, LATE_KP_OF_KV), sensitivity=2.4, encoders=Encoders.BOTH,  # 2 is far too soft if late
     ),
     "link_encoder": Law(
         "link_encoder", lambda: shipped_control("realistic"), ("kv", "observer_radps", "cutoff_Hz"),
@@ -512,9 +512,8 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
         if objective == "settling":
             return math.log(one.settling_s) + 0.2 * math.log(one.error) + missed
         if least_error is not None:
-            return (
-                math.log(one.noise_Nm) + PENALTY * max(math.log(one.error / (QUIET_ERROR * least_error)), 0.0) + missed
-            )
+            allowed = QUIET_ERROR * least_error
+            return math.log(one.noise_Nm) + PENALTY * max(math.log(one.error / allowed), 0.0) + missed
         return math.log(one.error) + missed
 
     def best_of(least_error: float | None) -> Judged:
@@ -541,8 +540,9 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
 
         for x in law.starts(sorted(search.tried, key=of)):
             best = lowest_from(x, -0.3)
-        for search.kp_of_kv, step in product(law.kp_of_kv, _AGAIN):  # a simplex that has shrunk in a curved valley has
-            best = lowest_from(law.logarithms(best.settings), step)  # not found its lowest point
+        for kp_of_kv, step in product(law.kp_of_kv, _AGAIN):
+            search.kp_of_kv = kp_of_kv
+            best = lowest_from(law.logarithms(best.settings), step)  # a simplex that shrank in a curved valley
         return best
 
     best = best_of(None)

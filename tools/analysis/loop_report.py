@@ -260,8 +260,8 @@ def _braking_contradictions(config: Config) -> list[str]:
         found.append(
             f"{brakes} leaves the link swinging on its reducer at {swings_radps:.2g} rad/s, and above "
             f"limits.standstill_radps (={standstill_radps:g}) for {swings_s:.2g} s: sequence.stop_timeout_s "
-            f"(={sequence.stop_timeout_s:g}) leaves {left_s:.2g} s after braking (STOP_TIMEOUT); "
-            "brake less, or allow more time"
+            f"(={sequence.stop_timeout_s:g}) leaves {left_s:.2g} s after braking (STOP_TIMEOUT): "
+            "allow more time"
         )
     return found
 

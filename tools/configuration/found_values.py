@@ -6,14 +6,14 @@ replaces the file in one step; on any error the file stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import AoT, InlineTable, Table
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config, ConfigurationProblems
@@ -27,17 +27,19 @@ _BRANCHES = ("positive", "negative")
 _OPTIONAL = ("load", "temperature", "angle")  # sections of [friction] that only a motion identifies
 
 
-def document_of(text: str, mark: str = MARK) -> tuple[tomlkit.TOMLDocument, str]:
+def document_of(text: str, written: Container[str], mark: str = MARK) -> tuple[tomlkit.TOMLDocument, str]:
     """The document without the lines that begin with `mark`, and how its lines end; `ConfigurationError`.
 
-    A section that is an inline table or dotted keys, to which no section can be added, becomes one with a heading.
+    A section that is to be `written` and is an inline table or dotted keys, to which no section can be added, becomes
+    one with a heading, without its comments.
     """
     kept = "".join(line for line in text.splitlines(keepends=True) if not line.startswith(mark))
     try:
         document = tomlkit.parse(kept)
     except TOMLKitError as error:
         raise ConfigurationError(f"not valid TOML: {error}") from None
-    for name in dict.fromkeys(key.key for key, item in document.body if key is not None and _without_heading(item)):
+    without = (key.key for key, item in document.body if key is not None and _without_heading(item))
+    for name in [name for name in dict.fromkeys(without) if name in written]:
         values = document[name].unwrap()
         document.remove(name)
         document[name] = values
@@ -48,7 +50,9 @@ def _without_heading(item: Any) -> bool:
     """Whether it is an inline table, or the dotted keys of a table."""
     if not isinstance(item, Table):
         return isinstance(item, InlineTable)
-    return item.is_super_table() and any(not isinstance(one, Table) or _without_heading(one) for one in item.values())
+    return item.is_super_table() and any(
+        not isinstance(one, (Table, AoT)) or _without_heading(one) for one in item.values()
+    )
 
 
 def friction_snippet(values: dict[str, Any], remarks: list[str]) -> str:
@@ -62,7 +66,7 @@ def friction_snippet(values: dict[str, Any], remarks: list[str]) -> str:
 
 def with_friction_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
     """`text` with its [friction] replaced or appended; other keys of it ([friction.lugre]) and all comments stay."""
-    document, newline = document_of(text)
+    document, newline = document_of(text, ("friction",))
     friction = document.get("friction")
     if friction is None:
         kept = tomlkit.dumps(document)
@@ -81,7 +85,7 @@ def with_friction_section(text: str, values: dict[str, Any], remarks: list[str])
 
 def with_map(text: str, values: dict[str, Any], remark: str) -> str:
     """`text` with [reducer.map] replaced or added, [ripple] where it has no [reducer]; other comments stay."""
-    document, _ = document_of(text)
+    document, _ = document_of(text, ("reducer", "ripple"))
     reducer = document.get("reducer")
     table = _fill(document, "ripple", values) if reducer is None else _fill(reducer, "map", values)
     table.comment(MARK.removeprefix("# ") + remark)
@@ -216,7 +220,7 @@ def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]])
 
     Sections that are not there are added at the end.  Comments stay, but those of an earlier tune.
     """
-    document, newline = document_of(text, TUNED_MARK)
+    document, newline = document_of(text, {one.section[0] for one in values}, TUNED_MARK)
     inserted = set()  # headings
     for one in values:
         table: Any = document

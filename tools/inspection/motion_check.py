@@ -124,7 +124,8 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     steps_radps = COUNTS_IN_VELOCITY * velocity_of_a_count_radps(config)
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
     plan = CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
-    most = max(travel, min(TRAVEL_MAX_rad, of_range))
+    # a joint that stands in the middle may have what it needs for a softer spring
+    most = max(travel, min(TRAVEL_MAX_rad, of_range), min(TRAVEL_rad, 2.0 * of_range))
     least_Nm = LEAST_FRICTIONS * static_Nm + plan.gravity_Nm if static_Nm and not given else plan.torque_Nm
     while not passes(config_of_check(config, plan)):
         if plan.travel_rad < most:

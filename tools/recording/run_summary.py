@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 SETTLED_RAD = 1e-3
-STARTING_s = 1.0  # of a period, in which the first one has the error of the start
+STARTING_s = 1.0
 # fields of the summary by their names for people; LogRecord has the times with _ns, the loop a histogram of each
 TORQUES = {
     "command torque": "command_torque_Nm", "measured torque": "measured_torque_Nm",
@@ -161,19 +161,21 @@ def _error(error_rad: np.ndarray, time_s: np.ndarray) -> ErrorSummary | None:
 def learning_factor(trajectory: TrajectoryConstants, table: np.ndarray, rows: Any) -> float | None:
     """RMS error while learning adds torque, over that of the first period at the same places in it.
 
-    Of the records of TRACKING; None where the motion does not repeat in them, or nothing was learned.
+    Of the records of TRACKING; None where the motion does not repeat in them, or nothing was learned.  The start of
+    each period is left out: the first one has the transient of observer and adaptation there.
     """
-    places = np.array([repetition(trajectory, table, one) for one in rows.trajectory_s]).reshape(-1, 3)
     squares_rad2, adds = np.asarray(rows.error_rad) ** 2, np.asarray(rows.learned_torque_Nm) != 0.0
+    if not np.any(adds):
+        return None
+    places = np.array([repetition(trajectory, table, one) for one in rows.trajectory_s])
     first_rad2 = later_rad2 = 0.0
     for epoch in np.unique(places[places[:, 1] > 0.0, 0]):
         same = places[:, 0] == epoch
-        begin_s, period_s, local_s = rows.trajectory_s[same][0], places[same][0, 1], places[:, 2]
-        started, over = same & (local_s >= min(STARTING_s, 0.25 * period_s)), rows.trajectory_s >= begin_s + period_s
+        since_s, period_s = rows.trajectory_s - rows.trajectory_s[same][0], places[same][0, 1]
+        started, over = same & (since_s % period_s >= STARTING_s), since_s >= period_s
         first, later = started & ~over, started & over & adds
         if np.any(first) and np.any(later):
-            order = np.argsort(local_s[first])
-            first_rad2 += np.sum(np.interp(local_s[later], local_s[first][order], squares_rad2[first][order]))
+            first_rad2 += np.sum(np.interp(since_s[later] % period_s, since_s[first], squares_rad2[first]))
             later_rad2 += np.sum(squares_rad2[later])
     return float(np.sqrt(later_rad2 / first_rad2)) if first_rad2 > 0.0 else None
 

@@ -97,10 +97,10 @@ class FaultText:
         return f"likely cause: {self.cause}; next: {self.next_step}"
 
 
-def motion_fault(fault: Fault, message: str, hint: str) -> MotionFault:
-    """The error for a motion that this ended, of the kind after which a measurement may go on in another way."""
+def ended_by(fault: Fault, text: FaultText, before: str = "", after: str = "", then: str = "") -> MotionFault:
+    """The error for a motion that this fault ended: what happened, between `before` and `after`, and the advice."""
     kind = {Fault.LIMIT_CYCLE: LimitCycle, Fault.POSITION_FROZEN: StoodStill}.get(fault, MotionFault)
-    return kind(message, hint)
+    return kind(f"{before}{fault.name} ({int(fault)}): {text.happened}{after}", text.advice + then)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_summary import RunSummary, save_run_figure, summary_table
-from jointctl.tools.session.fault_words import FaultText
+from jointctl.tools.session.fault_words import FaultText, ended_by
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
@@ -114,9 +114,7 @@ class RunResult:
         """The fault of this joint, which must have one."""
         assert self.fault_text is not None
         name = f"{self.name}: " if self.name else ""
-        return MotionFault(
-            f"{name}{self.fault.name} ({int(self.fault)}): {self.fault_text.happened}", self.fault_text.advice
-        )
+        return ended_by(self.fault, self.fault_text, before=name)
 
 
 # --- What a run says at its end: a fault in words, then the picture beside the log, and the table on stdout ---

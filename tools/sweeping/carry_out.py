@@ -38,7 +38,7 @@ from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.display import Display, Snapshot, run_display
-from jointctl.tools.session.fault_words import FaultText
+from jointctl.tools.session.fault_words import FaultText, ended_by
 from jointctl.tools.session.plan import Consent, Motion, Placed, RunPlan, TerminalConsent, joint_lines, remark_lines
 from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
 from jointctl.tools.session.session import Session
@@ -446,7 +446,7 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
 
 
 def _ended(fault: Fault, text: FaultText, what: str) -> MotionFault:
-    return MotionFault(f"{fault.name} ({int(fault)}): {text.happened}; no {what}", text.advice)
+    return ended_by(fault, text, after=f"; no {what}")
 
 
 def lockstep_log(config: Config, motion: Motion, consent: Consent, *, allow_low_margin: bool = False) -> Path | None:

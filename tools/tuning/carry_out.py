@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import (
-    ConfigurationError,
-    DataError,
-    MotionFault,
-    UsageError,
-    text_Nm,
-)
+from jointctl.drivers.errors import ConfigurationError, DataError, LimitCycle, MotionFault, UsageError, text_Nm
 from jointctl.firmware_py.states import AxisPhase, Fault, in_words
 from jointctl.firmware_py.trajectory import peak_of, quintic_s
 from jointctl.hil.canopen.records import PowerState
@@ -40,7 +34,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.recording.run_summary import learning_factor
 from jointctl.tools.session.control import Control
 from jointctl.tools.session.display import run_display
-from jointctl.tools.session.fault_words import FaultText, motion_fault
+from jointctl.tools.session.fault_words import FaultText, ended_by
 from jointctl.tools.session.plan import ConfiguredMotion, Motion, Placed, RunPlan, TerminalConsent, require_approach
 from jointctl.tools.session.result import require_off
 from jointctl.tools.session.session import Session
@@ -79,6 +73,10 @@ class TooQuick(MotionFault):
     """A joint that moved too fast: by less torque it may be measured, by a stiffer law it would move no slower."""
 
 
+class LearningSwings(LimitCycle):
+    """Torque or error swung while iterative learning added torque, which need not be the cause."""
+
+
 class TooStiff(MotionFault):
     """A joint that swung fast: its torque is later than is known yet, or its reducer softer."""
 
@@ -108,8 +106,10 @@ class Carried:
 
 def _ended(title: str, carried: Carried) -> MotionFault:
     assert carried.text is not None
-    message = f"{title}: {carried.fault.name} ({int(carried.fault)}): {carried.text.happened}"
-    return motion_fault(carried.fault, message, carried.text.advice)
+    error = ended_by(carried.fault, carried.text, before=f"{title}: ")
+    if carried.fault is Fault.LIMIT_CYCLE and np.any(carried.records.learned_torque_Nm != 0.0):
+        return LearningSwings(error.message, error.hint)
+    return error
 
 
 @dataclass
@@ -247,17 +247,22 @@ def verified(
 
     Other faults as `Carrier.run` has them.
     """
-    moving, table = with_motion(config, verifying), trajectory_table(config.changed(trajectory=verifying))
+    moving = with_motion(config, verifying)
+    table = trajectory_table(moving)
     carried = carrier.run(moving, VerifyingMotion(moving, table, found), title, also_faults=also_faults)
     rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
     later = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * verifying.duration_s)]
     if carried.text is not None or not len(later):
         return {"fault": carried.fault.name}
-    error = 1e3 * np.asarray(later.error_rad)
+    error, factor = 1e3 * np.asarray(later.error_rad), learning_factor(trajectory_constants(moving, table), table, rows)
+    if factor is None and config.control.learning is not None:
+        carrier.output.note(
+            "  whether iterative learning helps was not seen: the motion did not repeat for long enough"
+        )
     return {
         "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
         "chatter_Nm": float(np.mean(np.abs(np.diff(later.command_torque_Nm)))), "log": carried.log,
-        "seconds": verifying.duration_s, "learning": learning_factor(trajectory_constants(moving, table), table, rows),
+        "seconds": verifying.duration_s, "learning": factor,
     }  # fmt: skip
 
 

@@ -39,6 +39,7 @@ from jointctl.tools.configuration.conversions import (
 )
 from jointctl.tools.configuration.found_values import Found, rounded
 from jointctl.tools.configuration.records import APPROACH_MIN_S, table_constants
+from jointctl.tools.session.fault_words import ended_by
 from jointctl.tools.session.plan import Placed, joint_lines, remark_lines
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.frequency_response import motor_fed, room_rad
@@ -341,7 +342,9 @@ def measured_bristles(config: Config, carrier: Carrier) -> dict[str, Any]:
         return {"why": "the travel is too short, the encoder too coarse, or no spring keeps the margin"}
     carried = carrier.run(motion.config, motion, "bristles", also_faults=SPRINGS)
     if carried.text is not None:
-        return {"why": f"{carried.fault.name}: {carried.text.happened}"}
+        if carried.log:
+            carrier.output.note(f"log: {carried.log}")
+        return {"why": ended_by(carried.fault, carried.text).message}
     frictions_Nm = static_frictions_Nm(config, config.friction)
     found = bristles_of(motion, carried.records, frictions_Nm)
     if found is None:

@@ -262,15 +262,14 @@ class Sweep:
                 )
 
     def _raise_fault(self, fault: Fault, text: FaultText | None) -> None:
-        from jointctl.tools.session.fault_words import motion_fault
+        from jointctl.tools.session.fault_words import ended_by
 
         if text is None:
             return
         done = len(self.file.done) if self.file is not None else 0
         points = "1 point is" if done == 1 else f"{done} points are"
         kept = f"{points} in {self.out}" if done else "nothing was measured"
-        message = f"{fault.name} ({int(fault)}): {text.happened}; {kept}"
-        raise motion_fault(fault, message, text.advice + ("; then --resume" if done else ""))
+        raise ended_by(fault, text, after=f"; {kept}", then="; then --resume" if done else "")
 
     def _report(self, stopped: str | None) -> int:
         from jointctl.tools.session import result as drive_end

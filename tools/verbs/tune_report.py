@@ -20,7 +20,7 @@ from jointctl.tools.recording.report_page import Paragraph, Section, from_termin
 from jointctl.tools.recording.report_page import Table as PageTable
 from jointctl.tools.tuning.carry_out import SWEEP_SHARE, response_task
 from jointctl.tools.tuning.frequency_response import bode_figure, speed_and_period
-from jointctl.tools.tuning.joint_fit import values_of_gravity
+from jointctl.tools.tuning.joint_fit import values_of_fit, values_of_gravity
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text
 from jointctl.tools.verbs.map import speeds_in_turn
 from jointctl.tools.verbs.response import AS_IT_FITS, fit_table
@@ -47,6 +47,14 @@ def too_soft(job: Tune, error: JointctlError) -> str:
         f"late, leaves kv {kv_1ps:.3g}, which damps {config.joint.inertia_kgm2 * kv_1ps:.3g} Nm s/rad{falls}: so soft "
         "a loop may stick and slip; an encoder on the motor besides, or a stiffer reducer, allows a stiffer one"
     )
+
+
+def fitted_values(job: Tune) -> list[Found]:
+    """What the response has found, with where it comes from."""
+    assert job.fit is not None
+    assert job.response is not None
+    source = f"95 %, response of {job.response.legs} legs at {job.response.peak_Nm:.2g} Nm"
+    return values_of_fit(job.original, job.fit, source)
 
 
 def envelope(job: Tune) -> list[str]:
@@ -81,7 +89,7 @@ def values_of(job: Tune) -> list[Found]:
     assert job.fit is not None
     gains = job.state["gains"]
     objective = f"{job.options.objective}, law {gains['law']}, worst phase margin {gains['phase_margin_deg']:.0f} deg"
-    values = [*job.fitted(), *values_of_gravity(job.state["gravity"])]
+    values = [*fitted_values(job), *values_of_gravity(job.state["gravity"])]
     before, after = job.original.control.model_dump(), job.config.control.model_dump()
     for key, value in after.items():
         if key not in ("learning", "adaptation") and value != before[key]:

@@ -37,7 +37,6 @@ from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config, Control
 from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
 from jointctl.tools.configuration.found_values import (
-    Found,
     with_break_away,
     with_friction,
     with_sliding,
@@ -62,6 +61,7 @@ from jointctl.tools.tuning.carry_out import (
     LEAST_LEGS,
     SWEEP_SHARE,
     Carrier,
+    LearningSwings,
     NotCarriedOut,
     SLOW_OBSERVER_radps,
     TooWeak,
@@ -87,7 +87,6 @@ from jointctl.tools.tuning.joint_fit import (
     fit_of,
     friction_of,
     gravity_of,
-    values_of_fit,
     values_of_gravity,
 )
 from jointctl.tools.tuning.presliding import bristle_values, bristles_text, measured_bristles
@@ -95,7 +94,7 @@ from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run, speeds_
 from jointctl.tools.verbs.response import AS_IT_FITS
 from jointctl.tools.verbs.sweep import Sweep
 from jointctl.tools.verbs.tune import TuneOptions
-from jointctl.tools.verbs.tune_report import too_soft, values_of, write_report
+from jointctl.tools.verbs.tune_report import fitted_values, too_soft, values_of, write_report
 from jointctl.tools.written_file import prepare_folder, replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "bristles", "map", "gains", "verification")
@@ -287,7 +286,7 @@ class Tune:
 
     def _take_response(self, kept: dict[str, Any]) -> None:
         self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
-        self.config = with_values(self.config, self.fitted())
+        self.config = with_values(self.config, fitted_values(self))
         self.carrier.output.note(
             f"  {'two masses' if self.fit.flexible else 'rigid'}, {self.fit.inertia_kgm2.value:.4g} kg m^2, "
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
@@ -307,12 +306,6 @@ class Tune:
             resonance_Hz = two_masses(self.original, reducer, 1.0, 1.0, False).resonance_Hz
             message = f"[reducer] has a resonance at {resonance_Hz:.0f} Hz, and the response shows none"
             raise ConfigurationError(f"{self.original.path}: {message}", "correct [reducer], or take it out")
-
-    def fitted(self) -> list[Found]:
-        assert self.fit is not None
-        assert self.response is not None
-        source = f"95 %, response of {self.response.legs} legs at {self.response.peak_Nm:.2g} Nm"
-        return values_of_fit(self.original, self.fit, source)
 
     def _with_control(self, control: Control) -> Config:
         config = self.config.changed(control=control)
@@ -370,12 +363,14 @@ class Tune:
                 break
             except (LimitCycle, StoodStill, TooFewPoints) as error:
                 done, last = command.file.done if command.file is not None else (), command is commands[-1]
-                if last and len(done) == len(command.plan.points) and not isinstance(error, TooFewPoints):
-                    found = self.found_friction = self.identified()  # it was at what had not settled once more
-                    break
-                if last or (isinstance(error, StoodStill) and not (done and self.config.reducer)):
-                    raise  # of a soft joint that has slid no encoder stands still: it sticks at low speed
-                self.carrier.output.note(f"  {error.message}: once more without the slowest plateaus")
+                if isinstance(error, StoodStill) and not self._sticks(command, len(done)):
+                    raise
+                if last and (isinstance(error, TooFewPoints) or len(done) < len(command.plan.points)):
+                    raise
+                what = "what was measured counts" if last else "once more without the slowest plateaus"
+                self.carrier.output.note(f"  {error.message}: {what}")
+                if last:  # it was at what had not settled once more
+                    found = self.found_friction = self.identified()
             finally:
                 seconds += command.file.elapsed_s if command.file is not None else 0.0
         return {
@@ -383,6 +378,11 @@ class Tune:
             "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model,
             "static_before": static_friction_Nm(self.config), "seconds": seconds,
         }  # fmt: skip
+
+    def _sticks(self, command: Sweep, done: int) -> bool:
+        """Whether a reading that stands is a soft joint's behind its link's encoder, which has slid in this sweep."""
+        soft = self.config.reducer is not None and self.config.encoder.side == "joint"
+        return soft and done > 0 and not command.options.resume
 
     def _sweep(self, command: Sweep) -> None:
         """Measure what is not measured yet; `NotCarriedOut` where somebody stopped it."""
@@ -515,9 +515,7 @@ class Tune:
             if factor is None or factor < 1.0:
                 return found
             harm = f"the error that repeats was {factor:.2f} times that of the first period"
-        except LimitCycle as error:
-            if self.config.control.learning is None:
-                raise
+        except LearningSwings as error:
             harm = error.message
         self.carrier.output.warning(f"iterative learning is left out: with it {harm}")
         self.config = self.config.changed(control__learning=None)
@@ -567,7 +565,8 @@ class Tune:
                 found = self._verified(self._with_control(control), "refinement")
                 runs.append({"kp": one.settings.kp, "kv": one.settings.kv, **found})
                 self.carrier.output.note(f"  kv {one.settings.kv:g}: {found.get('rmse_mrad', math.inf):.4f} mrad")
-                if found.get("rmse_mrad", math.inf) < REFINE_BETTER * error:
+                harms = (found.get("learning") or 0.0) >= 1.0
+                if found.get("rmse_mrad", math.inf) < REFINE_BETTER * error and not harms:
                     error, self.config = found["rmse_mrad"], self._with_control(control)
                     self.gains = replace(gains, best=one, missed={}, control=control)
                     self.state["gains"] = self._kept(self.gains)

@@ -493,6 +493,22 @@ def test_a_section_is_added_to_one_that_is_written_in_any_way(written: str) -> N
 
 
 @pytest.mark.parametrize(
+    "other",
+    [
+        "log = { keep = 2 }  # my runs\n",
+        "log.keep = 2  # my runs\n",
+        "[virtual]\ninertia_scale = 1.0  # mine\n\n[log]\nkeep = 2\n\n[[virtual.faults]]\nat_s = 1.0  # mine\n",
+    ],
+)
+def test_a_section_that_nothing_is_written_to_stays_with_its_comments(other: str) -> None:
+    values = [Found(("control",), "kp", 4.0, "")]
+    assert with_tuned(f"{other}\n[control]\nkp = 3.0\n", values, {}) == f"{other}\n[control]\nkp = 4.0\n"
+    if "[virtual]" in other:  # nor is one that is written to, and has a heading, lost
+        kept = with_tuned(other, [Found(("virtual",), "inertia_scale", 2.0, "")], {})
+        assert kept == other.replace("inertia_scale = 1.0 ", "inertia_scale = 2.0 ")
+
+
+@pytest.mark.parametrize(
     "written",
     [
         "reducer = { stiffness_Nmprad = 1e4, map = { direction = 1 } }\n",

@@ -224,7 +224,7 @@ def test_a_joint_that_breaks_loose_from_the_spring_has_no_bristles_that_are_meas
         return Carried(None, fault, FaultText("it moved", "cause", "next"), "")
 
     monkeypatch.setattr(Carrier, "run", run)
-    assert measured_bristles(shipped("precise"), carrier()) == {"why": f"{fault.name}: it moved"}
+    assert measured_bristles(shipped("precise"), carrier()) == {"why": f"{fault.name} ({int(fault)}): it moved"}
 
 
 @pytest.mark.parametrize(
