@@ -318,7 +318,7 @@ class Stream(Section):
     delay_s: Annotated[float, between(0.002, 1.0)] = 0.03  # by which the joint follows behind them
     timeout_s: Annotated[float, between(0.002, 10.0)] = 0.1  # between two of them, after which the next is a new start
     client_timeout_s: Annotated[float, between(0.05, 3600.0)] = 1.0  # silence of the program that ends the run
-    # "auto": half of what limits.torque_max_Nm gives the inertia beside gravity
+    # "auto": half of what limits.torque_max_Nm gives the inertia beside joint.gravity_Nm
     acceleration_max_radps2: Annotated[float | Literal["auto"], auto_or_number(1e-6, 1e9)] = "auto"
     # from one to the next; "auto": limits.following_error_max_rad
     jump_max_rad: Annotated[float | Literal["auto"], auto_or_number(1e-9, 100.0)] = "auto"
