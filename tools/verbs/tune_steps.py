@@ -516,7 +516,7 @@ class Tune:
                 return found
             harm = f"the error that repeats was {factor:.2f} times that of the first period"
         except LearningSwings as error:
-            harm = error.message
+            harm = error.message.removeprefix("verification: ")
         self.carrier.output.warning(f"iterative learning is left out: with it {harm}")
         self.config = self.config.changed(control__learning=None)
         self.state["gains"]["control"] = self.config.control.model_dump(mode="json", exclude_none=True)
