@@ -706,6 +706,15 @@ def test_the_bristles_of_a_soft_joint_are_left_alone(tmp_path: Path) -> None:
     assert job.config == config
 
 
+def refined(path: Path) -> Tune:
+    """A tune that goes on with the steps in its folder, and then refines what it chose."""
+    carrier = Carrier(outputs()[0], TerminalConsent(outputs()[0], assume_yes=True), None)
+    options = TuneOptions(lockstep=True, refine=True, resume=True)
+    job = Tune(load_config(path), options, carrier, path.with_suffix(".tune"))
+    job.carry_out()
+    return job
+
+
 def test_gains_that_measure_better_bring_their_own_margins(
     tuned: Tuned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -718,11 +727,7 @@ def test_gains_that_measure_better_bring_their_own_margins(
         return {"rmse_mrad": next(errors), "peak_mrad": 1.0, "chatter_Nm": 0.1, "learning": factor}
 
     monkeypatch.setattr(Tune, "_verified", verified)
-    output, *_ = outputs()
-    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
-    options = TuneOptions(lockstep=True, refine=True, resume=True)
-    job = Tune(load_config(path), options, carrier, path.with_suffix(".tune"))
-    job.carry_out()
+    job = refined(path)
     gains, kept = job.gains, job.state["gains"]
     assert gains is not None
     assert len(job.state["refinement"]["runs"]) > 1
@@ -744,11 +749,7 @@ def test_gains_with_which_learning_does_harm_are_no_better(
         return {"rmse_mrad": 0.1 if refined else 0.2, "learning": factor if refined else 0.5}
 
     monkeypatch.setattr(Tune, "_verified", verified)
-    output, *_ = outputs()
-    carrier = Carrier(output, TerminalConsent(output, assume_yes=True), None)
-    options = TuneOptions(lockstep=True, refine=True, resume=True)
-    job = Tune(load_config(path), options, carrier, path.with_suffix(".tune"))
-    job.carry_out()
+    job = refined(path)
     assert job.state["verification"]["after"]["rmse_mrad"] == (0.1 if factor < 1.0 else 0.2)
 
 

@@ -180,6 +180,11 @@ def learning_factor(trajectory: TrajectoryConstants, table: np.ndarray, rows: An
     return float(np.sqrt(later_rad2 / first_rad2)) if first_rad2 > 0.0 else None
 
 
+def learning_harms(factor: float | None) -> bool:
+    """Whether that factor says that the motion is better off without learning."""
+    return factor is not None and factor >= 1.0
+
+
 def _settling_s(error_rad: np.ndarray, time_s: np.ndarray) -> float | None:
     outside = np.flatnonzero(~(np.abs(error_rad) <= SETTLED_RAD))
     if len(error_rad) == 0 or (len(outside) and outside[-1] == len(error_rad) - 1):

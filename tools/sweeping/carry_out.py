@@ -20,7 +20,6 @@ from jointctl.drivers.errors import (
     INTERRUPTED,
     ConfigurationError,
     DataError,
-    MotionFault,
     UsageError,
     text_Nm,
     text_radps,
@@ -436,17 +435,13 @@ def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, d
         output.note(f"log: {result.log_path}")
     require_off(session.drive_state)
     if result.fault_text is not None:
-        raise _ended(result.fault, result.fault_text, what)
+        raise ended_by(result.fault, result.fault_text, after=f"; no {what}")
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; no {what}")
         return INTERRUPTED
     if result.log_lost:
         raise DataError(f"{result.log_path}: this log is lost; no {what}")
     return result
-
-
-def _ended(fault: Fault, text: FaultText, what: str) -> MotionFault:
-    return ended_by(fault, text, after=f"; no {what}")
 
 
 def lockstep_log(config: Config, motion: Motion, consent: Consent, *, allow_low_margin: bool = False) -> Path | None:
@@ -474,7 +469,7 @@ def simulated_run(
     joint, placed = begun
     run = joint.run_as_configured(placed.constants, placed.table)
     if (text := latched_text(config, run.state)) is not None:
-        raise _ended(run.fault, text, what)
+        raise ended_by(run.fault, text, after=f"; no {what}")
     return joint, run
 
 

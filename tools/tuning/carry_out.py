@@ -254,15 +254,11 @@ def verified(
     later = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * verifying.duration_s)]
     if carried.text is not None or not len(later):
         return {"fault": carried.fault.name}
-    error, factor = 1e3 * np.asarray(later.error_rad), learning_factor(trajectory_constants(moving, table), table, rows)
-    if factor is None and config.control.learning is not None:
-        carrier.output.note(
-            "  whether iterative learning helps was not seen: the motion did not repeat for long enough"
-        )
+    error = 1e3 * np.asarray(later.error_rad)
     return {
         "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
         "chatter_Nm": float(np.mean(np.abs(np.diff(later.command_torque_Nm)))), "log": carried.log,
-        "seconds": verifying.duration_s, "learning": factor,
+        "seconds": verifying.duration_s, "learning": learning_factor(trajectory_constants(moving, table), table, rows),
     }  # fmt: skip
 
 

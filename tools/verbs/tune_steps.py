@@ -51,6 +51,7 @@ from jointctl.tools.identification.identification import Identification
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
+from jointctl.tools.recording.run_summary import learning_harms
 from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.data_file import measured_before
 from jointctl.tools.sweeping.options import SweepOptions
@@ -511,10 +512,9 @@ class Tune:
         """Of the new gains; once more, and for good, without learning where it does not make the error smaller."""
         try:
             found = self._verified(self.config, "verification")
-            factor = found.get("learning")
-            if factor is None or factor < 1.0:
+            if not learning_harms(found.get("learning")):
                 return found
-            harm = f"the error that repeats was {factor:.2f} times that of the first period"
+            harm = f"the error that repeats was {found['learning']:.2f} times that of the first period"
         except LearningSwings as error:
             harm = error.message.removeprefix("verification: ")
         self.carrier.output.warning(f"iterative learning is left out: with it {harm}")
@@ -527,6 +527,8 @@ class Tune:
         rmse = {when: one["rmse_mrad"] for when, one in (("before", before), ("after", after)) if "rmse_mrad" in one}
         ended = f"; the file as it was: {before['fault']}" if "fault" in before else ""
         self.carrier.output.note(f"  RMSE {', '.join(f'{when} {one:.4f} mrad' for when, one in rmse.items())}{ended}")
+        if self.config.control.learning is not None and after.get("learning") is None:
+            self.carrier.output.note("  whether iterative learning helps was not seen: no repetition in time")
         if rmse.get("after", 0.0) > WORSE * rmse.get("before", math.inf):
             self.carrier.output.warning(f"the old gains track better; {self.folder / 'before.toml'} has them")
 
@@ -565,8 +567,8 @@ class Tune:
                 found = self._verified(self._with_control(control), "refinement")
                 runs.append({"kp": one.settings.kp, "kv": one.settings.kv, **found})
                 self.carrier.output.note(f"  kv {one.settings.kv:g}: {found.get('rmse_mrad', math.inf):.4f} mrad")
-                harms = (found.get("learning") or 0.0) >= 1.0
-                if found.get("rmse_mrad", math.inf) < REFINE_BETTER * error and not harms:
+                better = found.get("rmse_mrad", math.inf) < REFINE_BETTER * error
+                if better and not learning_harms(found.get("learning")):
                     error, self.config = found["rmse_mrad"], self._with_control(control)
                     self.gains = replace(gains, best=one, missed={}, control=control)
                     self.state["gains"] = self._kept(self.gains)
