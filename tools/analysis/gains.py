@@ -33,6 +33,7 @@ import numpy as np
 from jointctl.drivers.errors import ConfigurationError, text_Nm
 from jointctl.firmware_py.states import Encoders
 from jointctl.tools.analysis.linear_loop import (
+    CONTROLLERS,
     Array,
     LoopSettings,
     StateSpace,
@@ -45,7 +46,7 @@ from jointctl.tools.analysis.linear_loop import (
     sampled_joint,
     two_masses,
 )
-from jointctl.tools.analysis.margins import at_rate, cases, converging, margins_on_grid
+from jointctl.tools.analysis.margins import at_rate, cases, converging, margins_on_grid, row_response
 from jointctl.tools.configuration.checks import OBSERVING
 from jointctl.tools.configuration.config import Adaptation, Config, Control
 from jointctl.tools.configuration.conversions import (
@@ -247,7 +248,7 @@ def chosen_law(config: Config, wanted: str) -> Law:
     return LAWS[wanted]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judged:
     """One choice of gains; margins are those of the worst joint in the intervals."""
 
@@ -260,9 +261,9 @@ class Judged:
     step_Nm: float  # of the torque, when an encoder counts one on
     gate_deg: float  # least phase margin of the joints of the gate
     gate_sensitivity: float  # and their largest |S|
-    believed: Array = field(compare=False, repr=False)  # closed loop of the joint as it is believed, (states, states)
+    believed: Array = field(repr=False)  # closed loop of the joint as it is believed, (states, states)
 
-    @functools.cached_property
+    @property
     def settling_s(self) -> float:  # of its slowest mode
         return -self.settings.period_s / math.log(np.max(np.abs(poles_of(self.believed))))
 
@@ -424,21 +425,21 @@ class _Search:
         return self.tried[-1]
 
     def _judge(self, settings: LoopSettings) -> Judged:
-        controller = linear_loop(settings).controller
+        controller = CONTROLLERS[settings.kind](settings)
         believed = closed_loop(self._believed, controller)
         loops = [closed_loop(plants, controller) for plants in self._plants]
         if not all(come_to_rest(alike) for alike in loops):
             worst = max(float(np.max(np.abs(poles_of(alike)))) for alike in loops)
             if worst >= 1.0:
                 return Judged(settings, UNSTABLE * worst, 0.0, 1.0, UNSTABLE, 0.0, 0.0, 0.0, UNSTABLE, believed)
-        law = controller.response(self._z)
-        open_loops = -np.einsum("fe,jfe->jf", law[:, 0], self._responses)  # joints, frequencies, encoders
+        law = row_response(controller, self._z)
+        open_loops = -np.einsum("fe,jfe->jf", law, self._responses)  # joints, frequencies, encoders
         phases, gains, peaks = margins_on_grid(open_loops)
         phases, peaks = phases * self._eased, peaks / self._eased
         own, gate = slice(self._of_goals), slice(self._of_goals, None)
         sensitivity = 1.0 / (1.0 + open_loops[0])
         error = self._link * sensitivity * np.hypot(1.0 / self._omega, 1.0 / self.law.ripple_radps)
-        noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
+        noise = np.abs(law * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
         return Judged(
             settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
             float(np.min(phases[own])), float(np.min(gains[own])), float(np.max(peaks[own])),
@@ -522,8 +523,7 @@ def _chosen(config: Config, law: Law, intervals: Intervals, settings: LoopSettin
             for point in product(*(np.geomspace(*span) for span in spans)):
                 search.judged(np.log(point))
 
-        def of(one: Judged) -> float:
-            return cost(one, least_error)
+        of = functools.cache(functools.partial(cost, least_error=least_error))
 
         def lowest_from(x: Array, step: float) -> Judged:
             free = law.free(x)

@@ -437,13 +437,13 @@ def poles_of(loop: Array) -> ComplexArray:
     return np.asarray(np.linalg.eigvals(loop), dtype=np.complex128)
 
 
-_SQUARED = 16  # times: 65 s at 1 kHz
+_SQUARED = 18  # times: 262 s at 1 kHz
 
 
 def come_to_rest(loops: Array) -> bool:
     """Whether all closed loops (n, states, states) are seen to be stable: some power of each is less than 1.
 
-    That takes a fifth of the time of eigenvalues, which tell where the answer is no: of a slow loop it may be.
+    That takes a quarter of the time of eigenvalues, which tell where the answer is no: of a slow loop it may be.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_SQUARED):

@@ -5,6 +5,7 @@ Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); 
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -167,11 +168,14 @@ def learning_factor(trajectory: TrajectoryConstants, table: np.ndarray, rows: An
     squares_rad2, adds = np.asarray(rows.error_rad) ** 2, np.asarray(rows.learned_torque_Nm) != 0.0
     if not np.any(adds):
         return None
-    places = np.array([repetition(trajectory, table, one) for one in rows.trajectory_s])
     first_rad2 = later_rad2 = 0.0
-    for epoch in np.unique(places[places[:, 1] > 0.0, 0]):
-        same = places[:, 0] == epoch
-        since_s, period_s = rows.trajectory_s - rows.trajectory_s[same][0], places[same][0, 1]
+    switch_s = float(trajectory.switch_s) if repetition(trajectory, table, trajectory.switch_s).epoch else math.inf
+    for begin_s, end_s in ((0.0, switch_s), (switch_s, math.inf)):
+        same = (rows.trajectory_s >= begin_s) & (rows.trajectory_s < end_s)
+        period_s = repetition(trajectory, table, begin_s).period_s
+        if not (np.any(same) and period_s > 0.0):
+            continue
+        since_s = rows.trajectory_s - rows.trajectory_s[same][0]
         started, over = same & (since_s % period_s >= STARTING_s), since_s >= period_s
         first, later = started & ~over, started & over & adds
         if np.any(first) and np.any(later):
