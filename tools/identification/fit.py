@@ -19,7 +19,7 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import brentq, least_squares, minimize_scalar
 
-from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form, basis, branch, legendre
+from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form, Regression, basis, branch, legendre
 
 SCAN = 48  # values of ws
 
@@ -111,10 +111,10 @@ def _least_squares(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, floa
     return beta, float(residual @ residual)
 
 
-def solve_linear(problem: Problem, ws: float, knee: float) -> tuple[np.ndarray, float]:
+def solve_linear(problem: Problem, ws: float, regression: Regression) -> tuple[np.ndarray, float]:
     """Best linear parameters with 0 <= tc <= ts <= static_max; returns (beta, squared error)."""
     root, limit = np.sqrt(problem.weight), problem.static_max_Nm
-    columns, y = root[:, None] * basis(problem.form, problem.x, ws, knee), root * problem.y_Nm
+    columns, y = root[:, None] * regression.columns(ws), root * problem.y_Nm
     beta, rss = _least_squares(columns, y)
     if not problem.form.stribeck:
         if beta[0] >= 0.0:
@@ -161,13 +161,14 @@ def knee_candidates(problem: Problem) -> np.ndarray:
 
 
 def _best_ws(problem: Problem, knee: float, scan: int) -> Fit:
+    regression = Regression(problem.form, problem.x, knee)
     if not problem.form.stribeck:
         ws = problem.ws_high
-        beta, rss = solve_linear(problem, ws, knee)
+        beta, rss = solve_linear(problem, ws, regression)
         return Fit(problem, beta, ws, knee, rss)
 
     def cost(log_ws: float) -> float:
-        return solve_linear(problem, float(np.exp(log_ws)), knee)[1]
+        return solve_linear(problem, float(np.exp(log_ws)), regression)[1]
 
     grid = np.linspace(np.log(problem.ws_low), np.log(problem.ws_high), scan)
     costs = np.array([cost(g) for g in grid])
@@ -178,7 +179,7 @@ def _best_ws(problem: Problem, knee: float, scan: int) -> Fit:
         refined = minimize_scalar(cost, bounds=limits, method="bounded", options={"xatol": 1e-9})
         found.append((float(refined.fun), float(refined.x)))
     ws = float(np.exp(min(found)[1]))
-    beta, rss = solve_linear(problem, ws, knee)
+    beta, rss = solve_linear(problem, ws, regression)
     return Fit(problem, beta, ws, knee, rss)
 
 
@@ -494,10 +495,10 @@ def _at_limits(fit: Fit) -> dict[str, str]:
 
 def _ws_ends(fit: Fit, worst: float) -> tuple[float, float, tuple[bool, bool]]:
     """Least and greatest ws whose best fit has at most the error `worst`, and whether the data bound them."""
-    problem = fit.problem
+    problem, regression = fit.problem, Regression(fit.problem.form, fit.problem.x, fit.knee)
 
     def excess(log_ws: float) -> float:
-        return solve_linear(problem, float(np.exp(log_ws)), fit.knee)[1] - worst
+        return solve_linear(problem, float(np.exp(log_ws)), regression)[1] - worst
 
     scan = np.append(np.linspace(np.log(problem.ws_low), np.log(problem.ws_high), PROFILE_POINTS), np.log(fit.ws))
     scan.sort()

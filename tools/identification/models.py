@@ -15,6 +15,7 @@ parallel and a particle swarm does not find the minimum; in Legendre polynomials
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -78,29 +79,38 @@ def legendre_to_powers(knee: float) -> np.ndarray:
     return np.column_stack([one, z1, 1.5 * z2 - 0.5 * one, 2.5 * z3 - 1.5 * z1])
 
 
-def basis(form: Form, x: np.ndarray, ws: float, knee: float) -> np.ndarray:
-    """Columns (N, p) of the regression, in the order of `form.linear_names`; ws and knee in units of x."""
+class Regression:
+    """Columns (N, p) of the regression at places x (N,), in the order of `form.linear_names`.
 
-    def low(at: np.ndarray) -> np.ndarray:
-        decay = np.exp(-at / ws) if form.stribeck else np.zeros_like(at)
-        columns = [1.0 - decay]
-        if form.stribeck:
-            columns.append(decay)
+    Of them ws changes two at most: the others are computed once.  ws and knee are in units of x.
+    """
+
+    def __init__(self, form: Form, x: np.ndarray, knee: float) -> None:
+        self._stribeck = form.stribeck
+        beyond = x > knee if form.cubic else np.zeros(len(x), bool)
+        self._low = np.ones(len(x)) if form.continuous else np.where(beyond, 0.0, 1.0)  # has the terms of low speed
+        self._at = np.where(beyond, knee, x) if form.continuous else x
+        columns = [self._low] * (2 if form.stribeck else 1)
         if form.viscous:
-            columns.append(at)
-        return np.column_stack(columns)
+            columns.append(self._low * self._at)
+        if form.cubic:
+            polynomials = legendre(x, knee)
+            if form.continuous:
+                polynomials = polynomials[:, 1:] - legendre(np.array([knee]), knee)[:, 1:]
+            columns.append(np.where(beyond[:, None], polynomials, 0.0))
+        self._columns = np.column_stack(columns)
 
-    if not form.cubic:
-        return low(x)
-    beyond = x > knee
-    first = low(np.where(beyond, knee, x) if form.continuous else x)
-    polynomials = legendre(x, knee)
-    if form.continuous:
-        high = np.where(beyond[:, None], polynomials[:, 1:] - legendre(np.array([knee]), knee)[:, 1:], 0.0)
-    else:
-        first = np.where(beyond[:, None], 0.0, first)
-        high = np.where(beyond[:, None], polynomials, 0.0)
-    return np.column_stack([first, high])
+    def columns(self, ws: float) -> np.ndarray:
+        found = self._columns.copy()
+        if self._stribeck:
+            found[:, 1] = self._low * np.exp(-self._at / ws)
+            found[:, 0] -= found[:, 1]
+        return found
+
+
+def basis(form: Form, x: np.ndarray, ws: float, knee: float) -> np.ndarray:
+    """The columns of one regression."""
+    return Regression(form, x, knee).columns(ws)
 
 
 @dataclass(frozen=True)
@@ -230,7 +240,7 @@ EXPERIMENTS = {  # which would tell a parameter that the data leave open
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Samples:
     """What the model is computed from, (N,) each."""
 
@@ -245,6 +255,19 @@ class Samples:
         load, warming, waves = (None if v is None else v[chosen] for v in (self.load_Nm, self.warming_K, self.waves))
         moved = self.velocity_radps[chosen], self.acceleration_radps2[chosen], self.position_rad[chosen]
         return Samples(*moved, load, warming, waves)
+
+    @functools.cached_property
+    def gravity(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sine and cosine of the position."""
+        return np.sin(self.position_rad), np.cos(self.position_rad)
+
+
+@functools.lru_cache(maxsize=2)  # a fit and what it is compared with ask for the same some thousand times
+def _sides(samples: Samples, form: Form, top_radps: float, knee: float) -> list[tuple[str, Any, Any, Regression]]:
+    """Of each direction: its word, which samples it has, their speeds over the top speed, and the regression."""
+    x = np.abs(samples.velocity_radps) / top_radps
+    sides = [(word, sign * samples.velocity_radps > 0.0) for word, sign in SIGNS.items()]
+    return [(word, chosen, x[chosen], Regression(form, x[chosen], knee)) for word, chosen in sides]
 
 
 @dataclass(frozen=True)
@@ -277,20 +300,17 @@ class Model:
         if s.load_Nm is not None:
             tau = tau + (1.0 + value.get("load_scale", 0.0)) * s.load_Nm
         elif "gravity" in self.terms:
-            tau = tau + value["gravity_sin"] * np.sin(s.position_rad) + value["gravity_cos"] * np.cos(s.position_rad)
+            tau = tau + value["gravity_sin"] * s.gravity[0] + value["gravity_cos"] * s.gravity[1]
         return np.asarray(tau)
 
     def friction_Nm(self, value: Mapping[str, float], s: Samples, tau_Nm: np.ndarray) -> np.ndarray:
         """Opposing the motion: positive for a positive speed."""
         speed = np.abs(s.velocity_radps)
-        x = speed / self.top_radps
-        coulomb, rest = np.zeros(len(x)), np.zeros(len(x))
-        for word, sign in SIGNS.items():
-            chosen = sign * s.velocity_radps > 0.0
+        coulomb, rest = np.zeros(len(speed)), np.zeros(len(speed))
+        for word, chosen, x, regression in _sides(s, self.form, self.top_radps, self.knee):
             beta, ws = self.own(value, word)
-            decay = np.exp(-x[chosen] / ws) if self.form.stribeck else 0.0
-            coulomb[chosen] = beta[0] + (beta[1] - beta[0]) * decay if self.form.stribeck else beta[0]
-            rest[chosen] = basis(self.form, x[chosen], ws, self.knee) @ beta - coulomb[chosen]
+            coulomb[chosen] = beta[0] + (beta[1] - beta[0]) * np.exp(-x / ws) if self.form.stribeck else beta[0]
+            rest[chosen] = regression.columns(ws) @ beta - coulomb[chosen]
         coulomb = coulomb + value.get("load_coulomb", 0.0) * np.abs(tau_Nm)
         rest = rest + value.get("load_viscous", 0.0) * np.abs(tau_Nm) * speed
         if s.warming_K is not None:

@@ -27,7 +27,7 @@ from jointctl.tools.identification.fit import (
     vector_limits,
     with_noise,
 )
-from jointctl.tools.identification.models import FORMS, basis
+from jointctl.tools.identification.models import FORMS, Regression, basis
 from jointctl.tools.identification.swarm import (
     CHUNK,
     Samples,
@@ -113,7 +113,8 @@ def test_least_rmse_of_the_models_on_paper_data(seed):
 def test_the_minimum_over_ws_is_the_least_of_a_dense_scan():
     for seed in range(3):
         for problem in paper_problems(seed):
-            dense = [solve_linear(problem, ws, problem.knee)[1]
+            regression = Regression(problem.form, problem.x, problem.knee)
+            dense = [solve_linear(problem, ws, regression)[1]
                      for ws in np.geomspace(problem.ws_low, problem.ws_high, 1500)]  # fmt: skip
             assert project(problem).rss <= min(dense) * (1.0 + 1e-9)
 
@@ -125,7 +126,7 @@ def test_limits_of_static_and_coulomb_friction_hold_and_the_face_found_is_the_be
         u = np.sort(rng.uniform(0.02, 3.5, 40))
         y = rng.normal(0.0, 0.1) + 0.05 * u + rng.normal(0.0, 0.05, 40)
         problem = make_problem(FORMS["stribeck"], u, y, 1.0, (0.05, 0.5), 0.12)
-        beta, rss = solve_linear(problem, 0.05, 1.0)
+        beta, rss = solve_linear(problem, 0.05, Regression(problem.form, problem.x, 1.0))
         assert -1e-12 <= beta[0] <= beta[1] + 1e-12 <= 0.12 + 1e-11
         columns = basis(problem.form, problem.x, 0.05, 1.0)
         free = np.linalg.lstsq(columns, y, rcond=None)[0]
@@ -378,8 +379,10 @@ def test_the_interval_of_ws_ends_where_the_f_test_crosses_and_moves_with_the_noi
     noise = noise_of([fit])[0]
     for part in (1.0, 1.01):
         interval = uncertainty(fit, replace(noise, variance_Nm2=part * noise.variance_Nm2)).intervals["ws"]
+        regression = Regression(fit.problem.form, fit.problem.x, fit.knee)
         ends = [
-            solve_linear(fit.problem, end / fit.problem.top_radps, fit.knee)[1] for end in (interval.low, interval.high)
+            solve_linear(fit.problem, end / fit.problem.top_radps, regression)[1]
+            for end in (interval.low, interval.high)
         ]
         reached = 1.0 + 4.0 / len(fit.problem.x)
         allowed = fit.rss + part * reached * noise.variance_Nm2 * stats.f.ppf(0.95, 1, noise.freedom)
