@@ -85,6 +85,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Files are handed out to processes in this order: a long one at the end would be waited for by one core.  So those
     with a slow test come first, and in real time, where a test takes some seconds whichever it is, those with many.
+    In a file the slow ones come first: a process gets its next file when it has begun the last test but one.
     """
     in_real_time: Counter[Path] = Counter()
     for item in items:
@@ -95,8 +96,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for mark in item.iter_markers("slow"):
             if not (len(mark.args) == 1 and isinstance(mark.args[0], str)):
                 raise pytest.UsageError(f"{item.nodeid}: pytest.mark.slow needs its reason")
-    slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
-    items.sort(key=lambda item: (item.path not in slow, -in_real_time[item.path]))
+    slow = {item: item.get_closest_marker("slow") is not None for item in items}
+    with_slow = {item.path for item in items if slow[item]}
+    items.sort(key=lambda item: (item.path not in with_slow, -in_real_time[item.path], item.path, not slow[item]))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -130,6 +130,7 @@ def resident_kB(pid: int) -> int:
     return int(found[1])
 
 
+@pytest.mark.slow("a minute with a browser")
 def test_nothing_moves_before_start_and_stop_stops(bench: Any, browser: Browser) -> None:
     scope, tab, url = opened(bench, browser)
     assert tab.js("document.querySelector('[data-testid=\"start\"]').disabled") is True

@@ -39,7 +39,7 @@ SHORT = {
 @pytest.fixture
 def joint(bench: Any) -> Any:
     """The bench with a joint as that of `precise` running, whose tune is short; limits for a busy computer."""
-    bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=1.0,
+    bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=0.5,
                  sequence__supervisor_timeout_s=5.0, **SHORT)  # fmt: skip
     bench.virtual = bench.joint("joint.toml")
     return bench
