@@ -6,6 +6,7 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it; before numpy
 
+import copy
 import dataclasses
 import functools
 import gc
@@ -25,6 +26,8 @@ if os.environ.get("NUMBA_DISABLE_JIT") == "1":
     plain_records.use()
 
 from jointctl.drivers import stop_note
+from jointctl.drivers.canopen import drive as drive_module
+from jointctl.drivers.canopen import encoder as encoder_module
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.hil.canopen import dictionary, encoder_node
 from jointctl.tools import drawing
@@ -45,17 +48,18 @@ settings.register_profile("no clock", deadline=None, suppress_health_check=[*Hea
 settings.load_profile("no clock")
 
 
-_load_entries = dictionary.load_entries
-_entries_of_shipped_file = functools.cache(_load_entries)
+def read_once(read: Callable[..., Any]) -> Callable[..., Any]:
+    """A shipped EDS file is read once, which takes most of the time that it takes to begin with a (virtual) drive."""
+    of_shipped = functools.cache(read)
+
+    def reading(path: Path, node: int, **more: bool) -> Any:
+        return copy.copy((of_shipped if path.parent.resolve() == CONFIGS else read)(path, node, **more))
+
+    return reading
 
 
-def entries_read_once(eds_path: Path, node_id: int) -> dict[tuple[int, int], dictionary.Entry]:
-    """As `load_entries`: a shipped EDS file is read once, which takes most of the time that a virtual drive takes."""
-    shipped = eds_path.parent.resolve() == CONFIGS
-    return dict(_entries_of_shipped_file(eds_path, node_id)) if shipped else _load_entries(eds_path, node_id)
-
-
-dictionary.load_entries = encoder_node.load_entries = entries_read_once
+dictionary.load_entries = encoder_node.load_entries = read_once(dictionary.load_entries)
+drive_module.read_eds = encoder_module.read_eds = read_once(drive_module.read_eds)
 
 
 def pytest_configure() -> None:
