@@ -21,16 +21,19 @@ from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.hil.plant import plant, step_plant
 from jointctl.hil.plant_records import DELAY_SLOTS
-from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, sampled_joint
+from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, loop_settings, sampled_joint
 from jointctl.tools.analysis.margin_gate import longest_delay_s, remedies
 from jointctl.tools.analysis.margins import (
     delay_margin_s,
     least_between,
     margins,
+    margins_on_grid,
     phase_margin_deg,
+    row_response,
     theory,
     zero_between,
 )
+from tests.configurations import shipped
 
 
 # --- Zeros and minima by narrowing, against places that are known ---
@@ -54,6 +57,26 @@ def test_a_minimum_inside_and_at_either_end(low: float, high: float, place: floa
     found, value = least_between(lambda x: np.abs(x - 1.0) + 0.25, low, high)
     assert found == pytest.approx(place, abs=1e-8)
     assert value == pytest.approx(abs(place - 1.0) + 0.25, abs=1e-8)
+
+
+# --- Two ways to the same response, and margins read off a grid ---
+@pytest.mark.parametrize("name", ["precise", "paper", "realistic", "csp"])
+def test_a_row_of_many_points_is_the_response(name: str) -> None:
+    chosen, _ = loop_settings(shipped(name))
+    z = np.exp(1j * np.geomspace(1.0, math.pi / chosen.period_s, 300) * chosen.period_s)
+    law = linear_loop(chosen).controller
+    expected = law.response(z)[:, 0]
+    np.testing.assert_allclose(row_response(law, z), expected, rtol=0.0, atol=1e-9 * np.max(np.abs(expected)))
+
+
+def test_margins_on_a_grid_are_those_of_the_loop() -> None:
+    chosen, _ = loop_settings(shipped("precise"))
+    omega = np.geomspace(1.0, math.pi / chosen.period_s, 2000)
+    (phase,), (gain,), (peak,) = margins_on_grid(linear_loop(chosen).open_loop(omega)[None, :])
+    exact = margins(chosen)
+    assert phase == pytest.approx(exact.phase_margin_deg, abs=0.01)
+    assert gain == pytest.approx(min(exact.gain_margin_up, 1.0 / max(exact.gain_margin_down, 1e-9)), rel=1e-3)
+    assert peak == pytest.approx(exact.sensitivity_peak, rel=1e-3)
 
 
 # --- The loops of section 4 of the control specification ---
