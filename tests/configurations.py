@@ -16,7 +16,7 @@ from tests.places import CONFIGS
 
 VIRTUAL = (CONFIGS / "virtual.toml").read_text()
 SLOW_LOOP = {  # 100 Hz: gains for that rate, and limits for a busy computer
-    "loop__rate_Hz": 100.0, "loop__priority": None, "drive__heartbeat_s": 0.6, "limits__sample_age_max_s": 1.0,
+    "loop__rate_Hz": 100.0, "loop__priority": None, "drive__heartbeat_s": 0.8, "limits__sample_age_max_s": 1.0,
     "limits__skipped_max_s": 1.0, "limits__following_error_max_rad": 0.6, "limits__position_jump_max_rad": 0.1,
     "sequence__supervisor_timeout_s": 5.0, "control__kp": 36.0, "control__kv": 12.0, "control__lyapunov_q": 100.0,
     "control__learning_rate": 1.0, "control__velocity_cutoff_Hz": 25.0, "trajectory__amplitude_rad": 0.1,
