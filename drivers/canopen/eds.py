@@ -16,6 +16,7 @@ from canopen.objectdictionary import ODRecord, ODVariable
 from canopen.objectdictionary import datatypes as types
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import read_input
 
 # --- data types of the objects that jointctl uses, by CiA 301, 402 and 406: what a file is measured by ---
 
@@ -64,7 +65,6 @@ def standard_type(index: int, sub: int, *, encoder: bool = False) -> int | None:
 
 # --- the file's text (CiA 306) as sections of keys: nothing here raises for a bad line, every defect is one remark ---
 
-LARGEST_BYTES = 16_000_000
 LONGEST_NUMBER = 40
 LONGEST_SHOWN = 60
 Sections = dict[str, dict[str, str]]
@@ -106,13 +106,11 @@ def decoded(data: bytes) -> tuple[str, list[str]]:
 
 def read_text(path: Path) -> tuple[str, list[str]]:
     """The file's text and what is odd about its encoding; `ConfigurationError` if it cannot be read at all."""
-    refusal = f"drive.eds (={path}) is not a readable EDS file:"
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise ConfigurationError(f"{refusal} {path.stat().st_size} bytes, at most {LARGEST_BYTES} are read")
-        return decoded(path.read_bytes())
+        return decoded(read_input(path))
     except OSError as error:
-        raise ConfigurationError(f"{refusal} {error.strerror or error}") from error
+        refusal = f"drive.eds (={path}) is not a readable EDS file: {error.strerror or error}"
+        raise ConfigurationError(refusal) from error
 
 
 def parse_sections(text: str) -> tuple[Sections, list[str]]:
@@ -211,6 +209,7 @@ def read_eds(path: Path, node: int, *, encoder: bool = False) -> EdsFile:
         match = _SUB_INDEX.fullmatch(name)
         if match is not None and int(match[1], 16) >= DEFTYPES:
             _take_member(eds, int(match[1], 16), int(match[2], 16), keys, sections, node)
+    _give_each_pdo_a_mapping(eds)
     if not len(eds.dictionary):
         key = "joint_encoder.eds" if encoder else "drive.eds"
         raise ConfigurationError(f"{key} (={path}) is not a readable EDS file: it describes no object")
@@ -327,6 +326,14 @@ def _value(eds: EdsFile, index: int, sub: int, key: str, text: str, data_type: i
         )
         return None
     return value
+
+
+def _give_each_pdo_a_mapping(eds: EdsFile) -> None:
+    """A PDO whose mapping the file leaves out has an empty one: the library looks up the mapping of each PDO."""
+    for index in list(eds.dictionary):
+        if (0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00) and index + 0x200 not in eds.dictionary:
+            _defect(eds, index + 0x200, 0, f"is missing: PDO {index:04X} has no mapping")
+            eds.dictionary.add_object(ODRecord(f"{index + 0x200:04X}", index + 0x200))
 
 
 def _take_identity(eds: EdsFile, sections: Sections, node: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,25 @@ def test_members_without_their_object_and_compact_ones(tmp_path: Path) -> None:
     compact = "\n[3001]\nParameterName=Row\nObjectType=0x8\nDataType=0x7\nAccessType=rw\nCompactSubObj=3\n"
     eds = eds_of(tmp_path, TEXT + compact)
     assert [eds.dictionary.get_variable(0x3001, k) is not None for k in range(5)] == [True, True, True, True, False]
+
+
+def test_a_pdo_without_its_mapping_has_an_empty_one(tmp_path: Path) -> None:
+    """The `canopen` library looks up the mapping of every PDO, also of one that jointctl does not use."""
+    import canopen
+
+    for index in ("1A01", "1603"):
+        eds = eds_of(tmp_path, re.sub(rf"(?ms)^\[{index}(sub\d)?\].*?(?=^\[)", "", TEXT))
+        pdo = f"{int(index, 16) - 0x200:04X}"
+        assert eds.all_remarks() == [f"EDS drive.eds: [{index}] is missing: PDO {pdo} has no mapping"]
+        assert eds.dictionary.get_variable(int(index, 16), 0) is None
+        canopen.RemoteNode(5, eds.dictionary)
+
+
+def test_only_a_regular_file_is_read(tmp_path: Path) -> None:
+    """Not a FIFO without a writer either, which would never end: `new` looks at every EDS file of its folder."""
+    (tmp_path / "null.eds").symlink_to(os.devnull)
+    with pytest.raises(ConfigurationError, match="is not a readable EDS file: is a device, not a regular file"):
+        read_eds(tmp_path / "null.eds", 1)
 
 
 def test_a_file_without_objects_is_refused(tmp_path: Path) -> None:
