@@ -17,6 +17,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from jointctl.drivers.canopen.eds import Sections, number_of, parse_sections, read_text
+from jointctl.drivers.canopen.eds import shown as shown_text
 from jointctl.drivers.canopen.pdo import DISABLED
 from jointctl.drivers.canopen.sdo import download
 from jointctl.drivers.errors import DataError, printable
@@ -135,6 +136,7 @@ def shown(objects: Objects, place: Place, value: Value | None) -> str:
 FORMAT = "jointctl parameters 1"
 _DICTIONARIES = (".dcf", ".eds")
 _NUMBERS = INTEGERS | {datatypes.BOOLEAN}  # in a file
+_COMPACT_VALUES = re.compile(r"[0-9a-f]{4}value")
 _REMARK = re.compile(r"\s;")  # what follows in a line is none of its value
 
 
@@ -198,8 +200,10 @@ def _load_dictionary(path: Path, node: int) -> ParameterSet:
     found = ParameterSet(path.name)
     dictionary = read_dictionary(path, node)
     sections, _ = parse_sections(read_text(path)[0])
+    if compact := next(filter(_COMPACT_VALUES.fullmatch, sections), None):
+        raise DataError(f"{path}: [{compact}] has values of members without sections of their own, which are not read")
     for variable in variables(dictionary):
-        value = _from_dcf(variable, sections)
+        value = _from_dcf(path, variable, sections)
         if variable.readable and value is not None:
             found.put(variable, value)
     for sub, key in enumerate(("vendor_id", "product_code"), start=1):
@@ -209,20 +213,28 @@ def _load_dictionary(path: Path, node: int) -> ParameterSet:
     return found
 
 
-def _from_dcf(variable: ODVariable, sections: Sections) -> Value | None:
-    """As `Objects.value` gives it; None where the file has none that makes sense."""
-    if variable.data_type in _NUMBERS:
-        number = variable.value if variable.value is not None else variable.default
-        return bytes([number]) if number is not None and variable.data_type == datatypes.BOOLEAN else number
+def _from_dcf(path: Path, variable: ODVariable, sections: Sections) -> Value | None:
+    """As `Objects.value` gives it; None where the file has none; `DataError` for a setting's that is no number."""
     name = f"{variable.index:04x}"
-    keys = sections.get(f"{name}sub{variable.subindex:x}", sections.get(name, {}))
-    text = keys.get("parametervalue", keys.get("defaultvalue"))
-    if text is None or variable.data_type in TEXTS:
-        return text
-    try:
-        return float(text) if variable.data_type in datatypes.FLOAT_TYPES else bytes.fromhex(text)
-    except ValueError:
-        return None
+    section = f"{name}sub{variable.subindex:x}"
+    keys = sections.get(section, sections.get(name, {}))
+    wanted = keys.get("parametervalue")
+    text = keys.get("defaultvalue") if wanted is None else wanted
+    value: Value | None = text
+    if variable.data_type in _NUMBERS:
+        value = variable.value if wanted else variable.default
+        if value is not None and variable.data_type == datatypes.BOOLEAN:
+            value = bytes([value])
+    elif text is not None and variable.data_type not in TEXTS:
+        try:
+            value = float(text) if variable.data_type in datatypes.FLOAT_TYPES else bytes.fromhex(text)
+        except ValueError:
+            value = None
+    numeric = variable.data_type in (*_NUMBERS, *datatypes.FLOAT_TYPES)
+    if value is None and wanted and numeric and is_parameter(variable):  # else its default would be written
+        place = section if section in sections else name
+        raise DataError(f"{path}: [{place}] ParameterValue (={shown_text(wanted)}) is no number of its DataType")
+    return value
 
 
 def _dcf_value(variable: ODVariable, value: Value) -> str | None:

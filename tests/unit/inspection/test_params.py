@@ -191,6 +191,26 @@ class TestFiles:
         with pytest.raises(DataError, match=words):
             load_parameters(path)
 
+    @pytest.mark.parametrize("value", ["1.5", "banana", "-1", "0x100000000"])
+    def test_a_value_that_is_no_number_is_not_replaced_by_its_default(self, tmp_path: Path, value: str) -> None:
+        path = tmp_path / "p.dcf"
+        path.write_text(
+            re.sub(r"(?s)(\[6083\].*?)(DefaultValue=)", rf"\1ParameterValue={value}\n\2", EDS.read_text(), count=1)
+        )
+        with pytest.raises(DataError, match=rf"\[6083\] ParameterValue \(={value}\) is no number of its DataType"):
+            load_parameters(path)
+        path.write_text(path.read_text().replace(f"={value}\n", "=7\n"))
+        assert load_parameters(path).parameters[Place(0x6083)] == 7
+
+    def test_values_of_compact_members_are_not_replaced_by_their_default(self, tmp_path: Path) -> None:
+        path = tmp_path / "p.dcf"
+        compact = (
+            "\n[3001]\nParameterName=Row\nObjectType=8\nDataType=7\nAccessType=rw\nDefaultValue=1\nCompactSubObj=2\n"
+        )
+        path.write_text(EDS.read_text() + compact + "[3001Value]\nNrOfEntries=1\n2=9\n")
+        with pytest.raises(DataError, match=r"\[3001value\] has values of members without sections"):
+            load_parameters(path)
+
     @given(data=st.data())
     def test_every_value_survives_or_is_left_out(self, tmp_path_factory: pytest.TempPathFactory, data: Any) -> None:
         values = {Place(0x2000 + i): data.draw(of_type) for i, (_, of_type) in enumerate(KINDS)}
