@@ -186,7 +186,8 @@ class Identification:
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers, texts, lists and dicts; parameters mirrored, joint rad/s and motor Nm."""
         errors, swarm = self.errors_Nm, self.options.swarm
-        relative = relative_figures(errors, self.measured_Nm)
+        figures = relative_figures(errors, self.measured_Nm)
+        relative = [value if math.isfinite(value) else None for value in figures]
         return {
             "data": str(self.data.path), "data_sha256": self.data.sha256, "model": self.model,
             "reduction_ratio": self.data.reduction_ratio, "points": len(errors),

@@ -108,7 +108,10 @@ def _series(table: TableFile, given: ForeignFormat) -> RawMotion:
             what = f"{given.time_column} has dates or times of day"
             raise UsageError(f"--time-unit (={given.time_unit}) is for numbers: {what}", "leave it away")
         time_s = table.numbers(given.time_column, gaps=True) if stamps_s is None else stamps_s
-        time_s = (time_s - time_s[0]) * (SECONDS_PER_UNIT[given.time_unit] if stamps_s is None else 1.0)
+        known = time_s[np.isfinite(time_s)]
+        time_s = (time_s - (known[0] if len(known) else 0.0)) * (
+            SECONDS_PER_UNIT[given.time_unit] if stamps_s is None else 1.0
+        )
     else:
         assert given.sample_rate_Hz is not None
         names["time"] = "--sample-rate"

@@ -149,21 +149,28 @@ class TableFile:
         return (found[1] or found[2] or "").strip() if found else ""
 
     def timestamps_s(self, name: str) -> np.ndarray | None:
-        """Seconds (N,) since the first of a column of ISO 8601 or of times of day; None where the first is no such."""
+        """Seconds (N,) since the first of a column of ISO 8601 or of times of day; None where the first is no such.
+
+        A cell without a value is nan.
+        """
         import numpy as np
 
         index = self.column(name)
         cells = [split(line, self.mark)[index] for line in self.lines]
-        if not cells or not _TIMESTAMP.fullmatch(cells[0]):
+        first = next((cell for cell in cells if cell.lower() not in MISSING), "")
+        if not _TIMESTAMP.fullmatch(first):
             return None
         texts: list[str] = []
         zones: dict[str | None, str] = {}
         for line, cell in zip(self.numbered, cells, strict=True):
+            if cell.lower() in MISSING:
+                texts.append("NaT")
+                continue
             found = _TIMESTAMP.fullmatch(cell)
             zone = found[3] if found else None
             zones.setdefault(zone, cell)
             if found is None or len(zones) > 1:
-                wanted = f"a time as {cells[0]}" + (", in the same zone" if found else "")
+                wanted = f"a time as {first}" + (", in the same zone" if found else "")
                 raise DataError(f"{self.path}: line {line}: {self.columns[index]} (={cell[:40]}) must be {wanted}")
             clock = cell.removesuffix(zone or "").strip().replace(",", ".").replace(" ", "T")
             texts.append(clock if found[1] else "1970-01-01T" + clock.zfill(len(clock) + (clock[1] == ":")))
@@ -171,7 +178,7 @@ class TableFile:
             stamps = np.array(texts, "datetime64[ns]")
         except ValueError as error:
             raise DataError(f"{self.path}: {self.columns[index]}: not a time: {error}") from None
-        return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), float)
+        return np.asarray((stamps - stamps[~np.isnat(stamps)][0]) / np.timedelta64(1, "s"), float)
 
     def only(self, chosen: np.ndarray) -> TableFile:
         """The table with some of its lines, (N,) bool."""
@@ -339,7 +346,7 @@ def read_table(path: Path, delimiter: str = "auto") -> TableFile:
     _check_counts(path, body, mark, len(columns))
     return TableFile(
         path, hashlib.sha256(content).hexdigest(), columns, rows, np.array([n for n, _ in body]), mark,
-        mark != "," and _comma([split(line, mark) for line in sample]), content.endswith(b"\n"), tuple(notes),
+        mark != "," and _comma([split(line, mark) for line in sample]), text.endswith(("\n", "\r")), tuple(notes),
     )  # fmt: skip
 
 

@@ -314,6 +314,21 @@ def test_samples_without_a_value_are_left_out(tmp_path, columns, ours, empty):
     assert not motion.whole[1305:1325].any()
 
 
+@pytest.mark.parametrize("stamped", [False, True])
+@pytest.mark.parametrize("at", [0, 500])
+def test_a_time_without_a_value_costs_its_sample_alone(tmp_path, columns, ours, at, stamped):
+    body = [line.split(",") for line in lines({name: columns[name] for name in ("t", "q", "tau")})]
+    if stamped:
+        first = np.datetime64("2024-05-01T23:59:58", "us")
+        for cells in body:
+            cells[0] = str(first + np.timedelta64(round(1e6 * float(cells[0])), "us"))
+    body[at][0] = ""
+    path = written(tmp_path / "a.csv", "\n".join(["t,q,tau", *map(",".join, body)]) + "\n")
+    motion = read_motion(path, FORMAT, SETTINGS)
+    assert "t: 1 samples without a value: left out" in motion.notes
+    assert len(motion.time_s) == len(ours.time_s) - (at == 0)
+
+
 @pytest.mark.parametrize("name", ["t", "q", "tau"])
 def test_a_column_without_any_value_is_named(tmp_path, columns, name):
     with pytest.raises(DataError, match=f"{name}: has no value"):

@@ -152,6 +152,12 @@ def test_missing_file_and_folder(tmp_path):
         read_friction_data(tmp_path)
 
 
+def test_a_sweep_that_a_spreadsheet_saved_as_utf_16_is_not_cut_off(tmp_path):
+    path = write_sweep(tmp_path, rows())
+    path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-16"))
+    assert read_friction_data(path).velocity_radps == pytest.approx(SPEEDS)
+
+
 def test_a_sweep_cut_off_within_its_last_number_is_refused(tmp_path):
     path = write_sweep(tmp_path, rows())
     path.write_text(path.read_text()[:-1])

@@ -255,6 +255,13 @@ def test_friction_without_speed_and_noise_is_compared_with_rounding_by_nobody():
     assert not [w for w in found.warnings if "held-out" in w or "the least RMSE" in w]
 
 
+def test_friction_of_next_to_nothing_has_no_relative_error():
+    data = paper_data(0)
+    data = replace(data, motor_torque_Nm=1e-13 / np.max(np.abs(data.motor_torque_Nm)) * data.motor_torque_Nm)
+    result = identify_friction(data, QUICK).to_dict()
+    assert (result["relative_rmse"], result["relative_max_error"]) == (None, None)
+
+
 # --- Plausibility of an identified friction: constants, units, sides and signs that are wrong on purpose ---
 def test_one_point_far_off_on_the_wrong_side_is_told_as_such():
     data = paper_data(0)
