@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -49,6 +50,16 @@ LOAD_COLUMN = "load_Nm"  # of a sweep under known loads
 
 def _heading(sidecar: dict[str, Any]) -> str:
     return HEADING.replace("\n", f",{LOAD_COLUMN}\n") if sidecar.get("loaded") else HEADING
+
+
+def _shows_progress(sidecar: dict[str, Any]) -> bool:
+    """Whether it says, as this module writes it, what was measured until when, and what of it did not settle."""
+    measured, unsettled, elapsed_s = (sidecar.get(key) for key in ("measured", "unsettled", "elapsed_s"))
+    return (
+        isinstance(measured, list) and all(type(index) is int and index >= 0 for index in measured)
+        and isinstance(unsettled, dict) and all(index.isdecimal() for index in unsettled)
+        and isinstance(elapsed_s, (int, float)) and 0.0 <= elapsed_s < math.inf
+    )  # fmt: skip
 
 
 def _replace(path: Path, text: str) -> None:
@@ -127,7 +138,7 @@ class SweepFile:
             raise DataError(
                 f"{path}: the sweep or its sidecar {beside.name} is damaged: it cannot be resumed"
             ) from None
-        if not isinstance(sidecar, dict) or "plan" not in sidecar or "measured" not in sidecar:
+        if not isinstance(sidecar, dict) or "plan" not in sidecar or not _shows_progress(sidecar):
             raise DataError(f"{beside}: is not the sidecar of a sweep")
         if sidecar["plan"] != plan:
             raise DataError(
@@ -135,8 +146,14 @@ class SweepFile:
                 "give the options and the configuration of the first time, or another -o",
             )
         rows = len(sidecar["measured"])
-        if len(lines) < rows + 1 or lines[0] != _heading(sidecar) or not "".join(lines[: rows + 1]).endswith("\n"):
-            raise DataError(f"{path}: holds {max(0, len(lines) - 1)} rows, its sidecar counts {rows}")
+        if lines[:1] != [_heading(sidecar)]:
+            raise DataError(
+                f"{path}: line 1 is not the heading that the sweep wrote, with its line end",
+                "another program has saved it: `identify` may read it, --resume needs it as it was",
+            )
+        whole = sum(line.endswith("\n") for line in lines) - 1
+        if whole < rows:
+            raise DataError(f"{path}: holds {whole} whole rows, its sidecar counts {rows}")
         if len(lines) > rows + 1:
             _replace(path, "".join(lines[: rows + 1]))
         return cls(path, sidecar, torque_constant_NmpA)

@@ -370,10 +370,25 @@ def test_another_plan_is_refused_and_nothing_is_changed(path: Path) -> None:
     ("csv", "sidecar", "words"),
     [
         (None, None, "cannot be read"),
-        (lambda text: "".join(text.splitlines(keepends=True)[:3]), str, "holds 2 rows, its sidecar counts 3"),
-        (lambda text: text.replace("velocity", "speed", 1), str, "holds 3 rows"),
+        (lambda text: "".join(text.splitlines(keepends=True)[:3]), str, "holds 2 whole rows, its sidecar counts 3"),
+        (lambda text: text[:-1], str, "holds 2 whole rows, its sidecar counts 3"),
+        (lambda text: text.replace("velocity", "speed", 1), str, "line 1 is not the heading that the sweep wrote"),
+        (lambda text: text.replace(",", ";"), str, "line 1 is not the heading that the sweep wrote"),
         (str, lambda text: text[:50], "damaged"),
         (str, lambda text: "[]", "not the sidecar"),
+        *(
+            (str, lambda text, changed=changed: json.dumps(json.loads(text) | changed), "not the sidecar")
+            for changed in (
+                {"measured": 3},
+                {"measured": ["a", 1, 2]},
+                {"measured": [-1, 1, 2]},
+                {"unsettled": [1]},
+                {"unsettled": {"a": "stuck"}},
+                {"elapsed_s": "x"},
+                {"elapsed_s": math.nan},
+                {"elapsed_s": None},
+            )
+        ),
     ],
 )
 def test_damaged_files_are_one_line(path: Path, csv: Any, sidecar: Any, words: str) -> None:
