@@ -329,7 +329,7 @@ TEMPLATE = SHIPPED_ARM.parent / "shoulder.toml"
 ARM_FILE = "arm.toml"
 # of the template, all of which go with the torque that the joint has
 _TORQUES = (
-    "rated_current_A|rated_torque_Nm|torque_rate_max_Nmps|ripple_Nm|tc_Nm|ts_Nm|tv|a0|a1|a2|a3|stiffness_Nmprad|"
+    "torque_rate_max_Nmps|ripple_Nm|tc_Nm|ts_Nm|tv|a0|a1|a2|a3|stiffness_Nmprad|"
     "damping_Nmspr|torque_ripple_Nm|current_limit_A|bristle_stiffness_Nmprad|bristle_damping_Nmspr"
 )
 _MOTOR_INERTIA_kgm2 = 1.2  # of the shipped arm's shoulder
@@ -399,6 +399,13 @@ def _scale(joint: UrdfJoint) -> float:
     return joint.effort_max_Nm / _template_value("torque_max_Nm")
 
 
+def _rated(joint: UrdfJoint) -> tuple[float, float]:
+    """Current [A] and torque [Nm] of the motor: whole mNm, as drives count it, and not less than the limit."""
+    template_Nm = _template_value("rated_torque_Nm")
+    torque_Nm = math.ceil(template_Nm * _scale(joint) / MILLI) * MILLI
+    return round(_template_value("rated_current_A") * torque_Nm / template_Nm, 6), round(torque_Nm, 6)
+
+
 def _template_value(key: str) -> float:
     found = re.search(rf"(?m)^{key} = (\S+)", TEMPLATE.read_text(encoding="utf-8"))
     assert found is not None, key
@@ -447,8 +454,11 @@ class _Draft:
         text = head + re.sub(r"\A#.*\n", "", text)
         swing_rad, frequency_Hz, middle_rad = self.swing(i)
         gains = _gain_keys(self.gains[i] if self.gains else _GAINS[-1])
+        rated_current_A, rated_torque_Nm = _rated(joint)
         values: dict[Place, object] = {
             ("drive", "node"): i + 1,
+            ("drive", "rated_current_A"): rated_current_A,
+            ("drive", "rated_torque_Nm"): rated_torque_Nm,
             ("limits", "position_min_rad"): low,
             ("limits", "position_max_rad"): high,
             ("limits", "velocity_max_radps"): joint.velocity_max_radps,

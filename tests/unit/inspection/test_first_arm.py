@@ -89,10 +89,12 @@ def test_its_loops_have_their_margins_and_it_moves_in_lockstep(tmp_path: Path) -
         assert np.max(np.abs(run.true_error_rad[run.tracking])) < 2e-3
 
 
-@pytest.mark.parametrize("effort", [1.5, 400.0])
-def test_whatever_the_effort_the_gains_suit_the_poses(tmp_path: Path, effort: float) -> None:
+@pytest.mark.parametrize("effort", [0.05, 1.5, 4.53, 400.0])
+def test_whatever_the_effort_the_gains_suit_the_poses_and_the_drive_has_it(tmp_path: Path, effort: float) -> None:
     text = robot(joint(1, LIMIT.format(effort=effort)), (effort / 100.0,))
-    (loop,) = joint_loops(load_arm(made(tmp_path, text)))
+    arm = load_arm(made(tmp_path, text))
+    LockstepArm(arm)  # commissions: the drive's rated torque is in whole mNm
+    (loop,) = joint_loops(arm)
     assert loop.margins.phase_margin_deg >= loop.config.margin.min_phase_margin_deg
 
 
