@@ -363,6 +363,8 @@ def _margin(name: str, omega: np.ndarray, response: np.ndarray, inner_stable: bo
     """
     size, away_deg = np.abs(response), np.degrees(np.angle(-response))  # from -180 deg
     turned = np.unwrap(np.angle(1.0 + response))
+    if turned[0] > 0.5 * math.pi:  # two integrators begin at -180 deg, with more lag than lead just beyond
+        turned -= math.tau
     stable = inner_stable and bool(abs(turned[-1]) < 0.5 * math.pi)
     crossings = np.flatnonzero((size[:-1] >= 1.0) != (size[1:] >= 1.0))
     if not len(crossings):

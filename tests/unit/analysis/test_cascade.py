@@ -172,6 +172,16 @@ def test_a_cascade_without_its_margin_is_refused_and_an_unstable_one_always() ->
         require_cascade(own_loop(position_gain_ps=900.0), 1e-3, allow_low_margin=True)
 
 
+@pytest.mark.parametrize(("share", "stable"), [(0.9, False), (1.1, True)])
+def test_a_velocity_loop_of_less_lead_than_lag_is_unstable(share: float, stable: bool) -> None:
+    """The two integrators take all of the phase: Kv/Ki must be more than the drive's delay and lag."""
+    gain = share * (1.5 / 2000.0 + 1e-3) * 1000.0
+    config = own_loop(loop_rate_Hz=2000.0, velocity_gain_Nmspr=gain, velocity_integral_Nmprad=1000.0)
+    config = config.changed(margin__current_lag_s=1e-3)
+    found = cascade_margins(config, 1e-3)[0]
+    assert (found.stable, found.phase_margin_deg > 0.0) == (stable, stable)
+
+
 def test_check_reports_both_loops_and_the_lead() -> None:
     out, err = io.StringIO(), io.StringIO()
     assert check(own_loop(), Output(json=True, stdout=out, stderr=err)) == 0
