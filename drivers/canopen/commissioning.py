@@ -33,7 +33,7 @@ from jointctl.drivers.canopen.pdo import (
     velocity_misfit,
 )
 from jointctl.drivers.canopen.sdo import ObjectAccess, object_name
-from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject
+from jointctl.drivers.canopen.settings import CanopenSettings, TorqueLimitObject, interpolation_period
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
 from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline, quick_stop_of
 from jointctl.drivers.drive import DriveIdentity
@@ -63,7 +63,6 @@ LARGEST_UNSIGNED = 0xFFFFFFFF
 STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
 STEEP_PERMILLE_PS = 1_000_000
 TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"
-LONGEST_PERIOD = 255  # of 60C2:1
 POSITION_INVERTED, VELOCITY_INVERTED = 0x80, 0x40  # of 607E
 WITHOUT_6007 = "no object 6007 (abort connection option): when this computer dies, in mode"
 MAX_TORQUE, TORQUE_LIMIT = "max torque", "torque limit"
@@ -448,17 +447,6 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     if findings.mode is Mode.TORQUE:
         findings.remarks += set_torque_slope(objects, scale, settings.torque_rate_max_Nmps)
     findings.settings["max torque"] = ", ".join(limits)
-
-
-def interpolation_period(rate_Hz: float) -> tuple[int, int]:
-    """(60C2:1, 60C2:2): the period as value x 10^exponent s; `DeviceError` where there is no such value."""
-    value, exponent = round(1e6 / rate_Hz), -6
-    while value % 10 == 0 and exponent < 0:
-        value //= 10
-        exponent += 1
-    if value > LONGEST_PERIOD:
-        raise DeviceError(f"loop.rate_Hz (={rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
-    return value, exponent
 
 
 def set_sync(objects: ObjectAccess, rate_Hz: float, *, cyclic: bool) -> dict[str, str]:

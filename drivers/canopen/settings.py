@@ -6,7 +6,21 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from jointctl.drivers.errors import DeviceError
+
 DRIVE_RANGE_COUNTS = 1 << 32  # of an object of the drive: a signed 32 bit number that runs over
+LONGEST_PERIOD = 255  # of 60C2:1
+
+
+def interpolation_period(rate_Hz: float) -> tuple[int, int]:
+    """(60C2:1, 60C2:2): the period as value x 10^exponent s; `DeviceError` where there is no such value."""
+    value, exponent = round(1e6 / rate_Hz), -6
+    while value % 10 == 0 and exponent < 0:
+        value //= 10
+        exponent += 1
+    if value > LONGEST_PERIOD:
+        raise DeviceError(f"loop.rate_Hz (={rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
+    return value, exponent
 
 
 @dataclass(frozen=True)

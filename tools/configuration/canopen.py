@@ -26,6 +26,7 @@ from jointctl.drivers.canopen.settings import (
     JointEncoderSettings,
     TemperatureObject,
     TorqueLimitObject,
+    interpolation_period,
 )
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.states import CommandKind
@@ -374,6 +375,11 @@ def canopen_problems(config: Config) -> list[str]:
     drive, limits, found = canopen_section(config), config.limits, []
     if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
         found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
+    elif drive.mode in ("cst", "csp", "csv"):  # in TQ, which auto may take, a drive need not have 60C2
+        try:
+            interpolation_period(config.loop.rate_Hz)
+        except DeviceError as error:
+            found.append(error.message)
     if LAST_SYNCHRONOUS < drive.rpdo_transmission_type < EVENT_DRIVEN:
         kind = drive.rpdo_transmission_type
         found.append(

@@ -68,6 +68,7 @@ def test_the_smallest_number_can_be_computed_with(tmp_path: Path) -> None:
     [
         ("rate_Hz = .*", "rate_Hz = 99.9", "loop.rate_Hz (=99.9) must be in [100..4000]"),
         ("rate_Hz = .*", "rate_Hz = 4001", "loop.rate_Hz (=4001) must be in [100..4000]"),
+        ("rate_Hz = .*", "rate_Hz = 333", "loop.rate_Hz (=333) has no 60C2 value: the period must be 1..255 x 10^n s"),
         ("rate_Hz = .*", "rate_Hz = nan", "loop.rate_Hz (=nan) must be finite"),
         ("rate_Hz = .*", 'rate_Hz = "1000"', "loop.rate_Hz (=1000) must be a number"),
         ("rate_Hz = .*", "rate_Hz = true", "loop.rate_Hz (=true) must be a number"),
@@ -299,6 +300,7 @@ def test_noise_is_also_what_comes_near_the_rate_limit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("rate_Hz", "refused"), [(399.0, True), (400.0, False)])
 def test_half_a_swing_is_at_least_four_periods(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
     text = VIRTUAL.replace("rate_Hz = 1000.0", f"rate_Hz = {rate_Hz}")
+    text = text.replace('mode = "cst"', 'mode = "tq"')  # which needs no 60C2
     if refused:
         (line,) = problems(tmp_path, ANCHOR, added("swing_slowest_s = 0.01"), text)
         assert line.startswith("limits.swing_slowest_s (=0.01) must be at least 4 periods, 0.0100251 s")

@@ -21,6 +21,7 @@ from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
 from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.canopen.settings import interpolation_period
 from jointctl.drivers.canopen.switch_off import state_of
 from jointctl.drivers.drive import UNTOUCHED
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
@@ -490,10 +491,10 @@ def test_an_encoder_resolution_that_cannot_be_read_is_none() -> None:
 
 def test_what_is_exactly_at_its_bound_is_taken(joint: Any) -> None:
     assert commissioning._compare_rated("rated_current_A", 9.0, 8.0, 0.125, "A") == []
-    assert commissioning.interpolation_period(1e6 / 255) == (255, -6)
-    assert commissioning.interpolation_period(0.1) == (10, 0)
+    assert interpolation_period(1e6 / 255) == (255, -6)
+    assert interpolation_period(0.1) == (10, 0)
     with pytest.raises(DeviceError, match="has no 60C2 value"):
-        commissioning.interpolation_period(1e6 / 256)
+        interpolation_period(1e6 / 256)
     with joint.opened() as drive:
         scale = drive.commission().torque_resolution_Nm
     full = {"max_torque_permille": 900, "rated_tolerance": 0.0}
