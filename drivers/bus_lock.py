@@ -100,8 +100,8 @@ STOP_WITHIN_S = 8.0  # how long a program may take to end after a stop, unless i
 class BusLock(contextlib.AbstractContextManager["BusLock"]):
     """Held until `close`; `BusError` names the program that has it.  No lock where the system has no such sockets.
 
-    `on_stop` is called in a thread of the lock when the user asks for a stop, once.  `remarks`: what was found and
-    does not keep this program off the bus.  `stopped`: whether the user has asked already, before it was held.
+    `on_stop` is called in a thread of the lock when the user asks for a stop, once.  `remarks`: what was found and does
+    not keep this program off.  `stopped`: whether the user has asked before it was held.  `name`: as `lock_name`.
     """
 
     def __init__(
@@ -118,8 +118,8 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
         self._starts = True  # it may still leave to another one that starts
         self._thread: threading.Thread | None = None
         self._process = os.getpid()
-        self._name = lock_name(interface, channel) if _has_lock(interface) else ""
-        if not self._name:
+        self.name = lock_name(interface, channel) if _has_lock(interface) else ""
+        if not self.name:
             return
         try:
             self._take_free_name()
@@ -129,16 +129,16 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
                 self._server.close()
             if error.errno in EXHAUSTED:
                 raise
-            self.stopped = stopped(self._name)  # no such sockets here
+            self.stopped = stopped(self.name)  # no such sockets here
             return
         self._thread = threading.Thread(target=self._serve, name="bus lock", daemon=True)
         self._thread.start()
         try:
             self._refuse_others()
             self._starts = False
-            self._marker = keep_from_forks(os.fdopen(os.memfd_create(self._name), "rb", buffering=0))
+            self._marker = keep_from_forks(os.fdopen(os.memfd_create(self.name), "rb", buffering=0))
             self.marker_fd = self._marker.fileno()
-            self.stopped = stopped(self._name)
+            self.stopped = stopped(self.name)
         except BaseException:
             self.close()
             raise
@@ -152,8 +152,8 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
 
     def settle(self) -> None:
         """The program ends because of a stop, of this bus or of another one that it has: it knows of all of them."""
-        if self._name:
-            settle(self._name)
+        if self.name:
+            settle(self.name)
 
     def close(self) -> None:
         """Leave the bus to others; may be called twice.  A process that is forked has nothing of it to leave.
@@ -179,7 +179,7 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
         """The first name that no one has; others may have all of them."""
         for number in range(NAMES):
             try:
-                self._server, self._number = keep_from_forks(listener(_address(self._name, number))), number
+                self._server, self._number = keep_from_forks(listener(_address(self.name, number))), number
                 return
             except OSError as error:
                 if error.errno != errno.EADDRINUSE:
@@ -187,7 +187,7 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
 
     def _refuse_others(self) -> None:
         """`BusError` where another controller has the bus, or processes of one that has died."""
-        holders = _holders(self._name, but=self._number)
+        holders = _holders(self.name, but=self._number)
         with contextlib.ExitStack() as stack:
             for holder in holders:
                 stack.callback(holder.close)
@@ -197,9 +197,9 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
                 if holder.is_controller and not (0 <= self._number < holder.number and holder.gives_way()):
                     raise self._refusal(holder.pid, f"another program controls {self._place}")
             strangers = [holder.pid for holder in holders if not holder.left]
-        if marked_processes(self._name):
+        if marked_processes(self.name):
             time.sleep(_RELEASE_S)
-        if marked := marked_processes(self._name):
+        if marked := marked_processes(self.name):
             text = f"another program that does not answer still controls {self._place}"
             raise self._refusal(marked[0], text)
         self.remarks += [
@@ -273,7 +273,7 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
         message = parsed_line(data)
         if message is None:
             return False
-        answer: dict[str, Any] = {"controls": self._name, "pid": os.getpid()}
+        answer: dict[str, Any] = {"controls": self.name, "pid": os.getpid()}
         if self._starts:
             answer["starts"] = True
         with contextlib.suppress(OSError):  # it has gone; its stop counts all the same
@@ -283,7 +283,7 @@ class BusLock(contextlib.AbstractContextManager["BusLock"]):
                 else:
                     answer["within_s"] = self._within_s
                     if self._delivers:
-                        settle(self._name)
+                        settle(self.name)
                     if self._on_stop is not None:
                         self._on_stop()
                         self._on_stop = None
@@ -423,7 +423,7 @@ def lock_name(interface: str, channel: str) -> str:
     place = f"{interface}:{channel}"
     if interface == "jointctl":
         path = socket_path(channel)
-        place = f"{interface}:{path}"
+        place = f"{interface}:{path}"  # until it is there
         with contextlib.suppress(OSError):
             found = os.stat(path)  # with its time: the number of a socket file that is gone is given to the next one
             place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}:{found.st_ctime_ns:x}"

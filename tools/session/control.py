@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock, stop_is_noted
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock, lock_name, stop_is_noted
 from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
 from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.errors import DeviceError, MotionFault, UsageError
@@ -218,10 +218,14 @@ FILES_S = 4.0  # for log and messages, after the drive is off
 
 @dataclass(frozen=True)
 class Control:
-    """`signals` raise KeyboardInterrupt except while the joint may have torque; child processes get `marker_fds`."""
+    """`signals` raise KeyboardInterrupt except while the joint may have torque; child processes get `marker_fds`.
+
+    `bus_is_there`: to be called when a virtual bus of the program's own has come, whose lock has another name then.
+    """
 
     signals: StopSignals
     marker_fds: tuple[int, ...] = ()
+    bus_is_there: Callable[[], None] = lambda: None
 
 
 def stop_within_s(config: Config) -> float:
@@ -318,19 +322,27 @@ def _locked(
     words = "; nothing moved"  # until the program has its locks
     try:
         with ExitStack() as stack:
-            locks = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in places]
-            for remark in (remark for lock in locks for remark in lock.remarks):
-                output.warning(remark)
-            for lock in locks:
-                lock.deliver()
-            if signals.commanded_ns or any(lock.stopped for lock in locks):
-                for lock in locks:
-                    lock.settle()
-                signals.on_stop_command()
-                if signals.raising:
-                    signals.leave_if_asked()
+            locks: list[BusLock] = []
+
+            def take() -> None:
+                names = [lock.name for lock in locks]
+                new = [place for place in places if lock_name(*place) not in names]
+                taken = [stack.enter_context(BusLock(*place, signals.on_stop_command, within_s)) for place in new]
+                locks.extend(taken)
+                for remark in (remark for lock in taken for remark in lock.remarks):
+                    output.warning(remark)
+                for lock in taken:
+                    lock.deliver()
+                if signals.commanded_ns or any(lock.stopped for lock in locks):
+                    for lock in locks:
+                        lock.settle()
+                    signals.on_stop_command()
+                    if signals.raising:
+                        signals.leave_if_asked()
+
+            take()
             words = ""
-            yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None))
+            yield Control(signals, tuple(lock.marker_fd for lock in locks if lock.marker_fd is not None), take)
     except KeyboardInterrupt:
         if words and any(stop_is_noted(*place) for place in places):
             signals.commanded_ns = signals.commanded_ns or time.monotonic_ns()

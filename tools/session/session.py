@@ -162,6 +162,7 @@ class Session:
     def _bus_there(self, loop: LoopHandle) -> Iterator[None]:
         if self.own is not None:  # what compiles the loop is there long before the bus is
             self.own.until_bus(self.signals.leave_if_asked)
+            self._control.bus_is_there()
         loop.bus_is_there()
         yield
 

@@ -159,7 +159,7 @@ def test_one_that_has_reached_the_holder_of_the_lock_is_known_to_it() -> None:
         reached.clear()
     with BusLock("socketcan", channel) as lock:
         assert not lock.stopped
-        write_note(lock._name)
+        write_note(lock.name)
     with BusLock("socketcan", channel) as lock:
         assert lock.stopped  # it was noted while the lock was held, and never asked for: that came too late
 

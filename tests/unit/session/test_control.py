@@ -325,6 +325,21 @@ def test_an_arm_has_the_locks_of_all_its_buses_and_a_stop_by_any_is_one_stop(vir
         assert ours.signals.commanded_ns == first_ns
 
 
+def test_a_stop_reaches_a_program_whose_virtual_bus_comes_after_its_lock(virtual_config: Any, tmp_path: Path) -> None:
+    place = "jointctl", str(tmp_path / "bus.sock")
+    config = virtual_config.model_copy(update={"bus": virtual_config.bus.model_copy(update={"channel": place[1]})})
+    with in_program(config, Output()) as ours:
+        ours.bus_is_there()  # it has the lock of that name already
+        Path(place[1]).touch()
+        ours.bus_is_there()
+        with pytest.raises(BusError, match="another program controls"):
+            BusLock(*place)
+        with StopCall(*place) as call:
+            wait_for_answers(call._holders)
+        assert ours.signals.request is StopRequest.QUICK_STOP
+    BusLock(*place).close()
+
+
 # --- Stop signals that come where an exception does not get through ---
 @ctypes.CFUNCTYPE(None)
 def stopped_in_a_callback() -> None:
