@@ -68,3 +68,13 @@ def test_a_demo_that_is_killed_while_it_starts_leaves_no_process_behind(bench: A
     started.process.wait(10.0)
     assert all(gone(pid, 120.0) for pid in children)  # the first start compiles before it looks around
     assert "Traceback" not in started.err
+
+
+def test_a_stop_finds_the_program_of_a_demo(bench: Any) -> None:
+    """Which has its lock before its virtual bus is there."""
+    started = bench.start("demo", "--duration", "60").saw("tracking")
+    pid = started.process.pid
+    stopped = bench.run("stop", "virtual", "-c", f"demo-{pid}")
+    assert stopped.code == 0, stopped.err
+    assert f"stopping the program that controls the bus (pid {pid})" in stopped.err
+    assert started.process.wait(30.0) == 130
