@@ -343,11 +343,12 @@ def test_the_loop_gets_its_own_bus_when_that_is_there_and_a_stop_ends_the_waitin
             alive()
             done.append("there")
 
-    session: Any = SimpleNamespace(own=Own(), signals=SimpleNamespace(leave_if_asked=leave_if_asked))
+    control = SimpleNamespace(bus_is_there=lambda: done.append("locked"))
+    session: Any = SimpleNamespace(own=Own(), signals=SimpleNamespace(leave_if_asked=leave_if_asked), _control=control)
     loop: Any = SimpleNamespace(bus_is_there=lambda: done.append("opened"))
     with pytest.raises(KeyboardInterrupt) if stopped else contextlib.nullcontext(), Session._bus_there(session, loop):
         done.append("run")
-    assert done == ([] if stopped else ["there", "opened", "run"])
+    assert done == ([] if stopped else ["there", "locked", "opened", "run"])
 
 
 def test_a_bus_of_others_is_there_from_the_beginning() -> None:
