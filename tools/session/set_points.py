@@ -86,7 +86,8 @@ def vector(name: str, given: object, names: Sequence[str]) -> tuple[float, ...]:
         values: Any = given if isinstance(given, (Sequence, np.ndarray)) and np.ndim(given) else (given,)
         numbers = tuple(map(_number, values))
     except (TypeError, ValueError):
-        raise SetPointError("a set-point must be made of numbers") from None
+        what = "a number" if len(names) == 1 else f"{len(names)} numbers, one a joint"
+        raise SetPointError(f"{name} (={str(given)[:40]}) must be {what}") from None
     if len(numbers) != len(names):
         raise SetPointError(f"{name} (={len(numbers)} numbers) must have {len(names)}, one a joint")
     return numbers

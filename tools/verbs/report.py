@@ -31,9 +31,9 @@ def report(
 
     if not 1 <= len(paths) <= MOST_LOGS:
         raise DataError(f"number of logs (={len(paths)}) must be in [1..{MOST_LOGS}]")
+    logs = [read_run_log(path) for path in paths]
     target = out or with_ending(paths[0], ".html" if len(paths) == 1 else ".comparison.html")
     check_target(target, paths)
-    logs = [read_run_log(path) for path in paths]
     for path, log in zip(paths, logs, strict=True):
         if len(log.records) < 2:
             raise DataError(f"{path}: nothing to report, the run has {len(log.records)} records")

@@ -130,7 +130,7 @@ def test_set_points_of_all_joints_are_followed_in_the_same_cycles(arm: jointctl.
         (([0.1] * 3, [0.0] * 3, [0.0, math.nan, 0.0]), "elbow: acceleration_radps2"),
         (([0.1] * 3, [0.0] * 3, None, [0.0, 0.0, 1e6]), r"wrist: torque_Nm \(=1e\+06\)"),
         (([0.1, 0.1],), r"position_rad \(=2 numbers\) must have 3, one a joint"),
-        (([0.1, 0.1, "x"],), "must be made of numbers"),
+        (([0.1, 0.1, "x"],), r"position_rad \(=\[0.1, 0.1, 'x'\]\) must be 3 numbers, one a joint"),
     ],
 )
 def test_what_is_wrong_with_one_joint_refuses_the_whole_set_point(

@@ -113,7 +113,7 @@ def test_where_no_set_point_comes_the_reference_brakes_and_never_goes_beyond(joi
         ((0.14,), "takes more than"),
         ((0.1, 0.0, math.nan), "acceleration_radps2"),
         ((0.1, 0.0, 0.0, 1e6), r"torque_Nm \(=1e\+06\)"),
-        (("x",), "must be made of numbers"),
+        (("x",), r"position_rad \(=x\) must be a number"),
     ],
 )
 def test_a_set_point_that_breaks_a_limit_is_refused_and_changes_nothing(
@@ -133,7 +133,7 @@ def test_a_set_point_that_breaks_a_limit_is_refused_and_changes_nothing(
     [
         *((time_s, "after the set-point before") for time_s in (7.0, 6.9, 7.5, 4e9)),
         *((time_s, r"time_s .* must be in \[-4e\+09..4e\+09\]") for time_s in (math.nan, math.inf, 1e12, -1e300)),
-        ("7.01", "made of numbers"),
+        ("7.01", r"time_s \(=7.01\) must be a number"),
     ],
 )
 def test_times_must_be_numbers_that_ascend_without_a_gap(joint: Joint, time_s: float, words: str) -> None:
