@@ -110,7 +110,8 @@ class Bench:
     def status_word(self, node: int = 1) -> int:
         """6041 as an independent client reads it; NMT first, since a stopped node answers no SDO.
 
-        Once more without an answer: the watchdog stops the node some time after a loop has gone, between the two too.
+        Where no answer comes, once more: some time after a loop has gone the watchdog puts the node into Stopped, which
+        may be between the NMT command and the request.
         Not while a program of ours has the drive and no loop runs: it would take these frames for another controller's.
         """
         network = self.network()

@@ -248,18 +248,19 @@ def margins_on_grid(open_loop: ComplexArray) -> tuple[Array, Array, Array]:
     Between two frequencies L is taken as straight: they are to be close enough.
     """
 
-    def crossed(values: Array, level: float, form: Callable[[Array], Array]) -> tuple[NDArray[np.intp], ComplexArray]:
-        """The rows in which `values` goes through `level` between two frequencies, and L where `form` of it is 0."""
-        above = values > level
+    def crossed(
+        above: NDArray[np.bool_], height: Callable[[ComplexArray], Array]
+    ) -> tuple[NDArray[np.intp], ComplexArray]:
+        """The rows in which `above` changes between two frequencies, and L there, where `height` of it is 0."""
         rows, at = np.nonzero(above[:, :-1] != above[:, 1:])
-        before, after = form(values[rows, at]), form(values[rows, at + 1])
-        share = before / (before - after)
-        return rows, (1.0 - share) * open_loop[rows, at] + share * open_loop[rows, at + 1]
+        before, after = open_loop[rows, at], open_loop[rows, at + 1]
+        share = height(before) / (height(before) - height(after))
+        return rows, (1.0 - share) * before + share * after
 
     phase, gain = np.full(len(open_loop), 180.0), np.full(len(open_loop), math.inf)
-    rows, at_one = crossed(np.abs(open_loop), 1.0, np.log)
+    rows, at_one = crossed(np.abs(open_loop) > 1.0, lambda found: np.log(np.abs(found)))
     np.minimum.at(phase, rows, np.degrees(np.abs(np.angle(-at_one))))
-    rows, real = crossed(open_loop.imag, 0.0, np.positive)
+    rows, real = crossed(open_loop.imag > 0.0, np.imag)
     rows, size = rows[real.real < 0.0], -real.real[real.real < 0.0]
     np.minimum.at(gain, rows, np.maximum(size, 1.0 / size))
     return phase, gain, 1.0 / np.min(np.abs(1.0 + open_loop), axis=1)
